@@ -1,6 +1,8 @@
-"""The site: `sphinx-build -W --keep-going docs build/site`. No network, nothing is executed.
+"""The site: `sphinx-build -W --keep-going docs build/site`. No network, nothing is
+executed.
 
-`pages.py` writes the generated pages into docs/generated: laws, API, constants, gallery, notebooks.
+`pages.py` writes the generated pages into docs/generated: laws, API, constants,
+gallery, notebooks.
 """
 
 import re
@@ -29,7 +31,8 @@ version = release = ji.__version__
 
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "sphinx_design"]
 nitpicky = True
-nitpick_ignore_regex = [("py:class", ".*")]  # types of fields: of other packages, mostly
+# types of fields: of other packages, mostly
+nitpick_ignore_regex = [("py:class", ".*")]
 exclude_patterns = ["paper.md"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
@@ -56,7 +59,8 @@ html_show_sphinx = False
 html_copy_source = False
 
 
-# ------------------------------------------------------------------------ formulas, as MathML
+# ------------------------------------------------------------------------ formulas, as
+# MathML
 
 LONG = 30  # characters beyond which a formula scrolls within itself on a phone
 
@@ -65,7 +69,8 @@ def mathml(node, block=False):
     """MathML of a formula; a warning names a text that is not a formula."""
     try:
         return tex2mathml(node.astext(), as_block=block)
-    except (MathError, AttributeError) as wrong:  # AttributeError: a new row outside of a table
+    # AttributeError: a new row outside of a table
+    except (MathError, AttributeError) as wrong:
         logging.getLogger(__name__).warning(
             "not a formula: %s (%s)", node.astext(), wrong, location=node
         )
@@ -75,7 +80,9 @@ def mathml(node, block=False):
 def _inline(writer, node):
     formula = mathml(node)
     signs = re.sub(r"\s|<[^>]*>", "", formula)
-    writer.body.append(f'<span class="math">{formula}</span>' if len(signs) > LONG else formula)
+    writer.body.append(
+        f'<span class="math">{formula}</span>' if len(signs) > LONG else formula
+    )
     raise nodes.SkipNode
 
 
@@ -84,7 +91,8 @@ def _block(writer, node):
     raise nodes.SkipNode
 
 
-# ---------------------------------------------------------------------------- texts and links
+# ---------------------------------------------------------------------------- texts and
+# links
 
 
 def _typeset(app, what, name, obj, options, lines):
@@ -93,15 +101,21 @@ def _typeset(app, what, name, obj, options, lines):
     for i, line in enumerate(lines):  # |x| is not a substitution
         if "|" in line and not line.lstrip().startswith(">>>"):
             spans = re.split(r"(:math:`[^`]*`|`[^`]*`)", line)
-            lines[i] = "".join(x if x.endswith("`") else x.replace("|", r"\|") for x in spans)
+            lines[i] = "".join(
+                x if x.endswith("`") else x.replace("|", r"\|") for x in spans
+            )
 
 
 def _skip(app, what, name, obj, skip, options):
     """Leave out fields of named tuples: the docstring of the class describes them."""
-    return True if (getattr(obj, "__doc__", "") or "").startswith("Alias for field") else skip
+    if (getattr(obj, "__doc__", "") or "").startswith("Alias for field"):
+        return True
+    return skip
 
 
-PUBLIC = {f"ji.{name}": name for names in pages.public_names().values() for name in names}
+PUBLIC = {
+    f"ji.{name}": name for names in pages.public_names().values() for name in names
+}
 PUBLIC |= {name: name for name in pages.law_names()}  # LZB, Newton, ...
 
 
@@ -109,19 +123,25 @@ def _link_names(app, doctree):
     """Link `ji.name`, and names of laws in tables, to where they are documented."""
     for literal in list(doctree.findall(nodes.literal)):
         name = re.sub(r"\(.*", "", literal.astext())
-        parents, node = [], literal
+        parents = []
+        node = literal
         while node.parent is not None:
             node = node.parent
             parents.append(node)
         if any(
-            isinstance(x, nodes.reference | nodes.title | addnodes.pending_xref) for x in parents
+            isinstance(x, nodes.reference | nodes.title | addnodes.pending_xref)
+            for x in parents
         ):
             continue
         in_table = any(isinstance(x, nodes.entry) for x in parents)
         if name not in PUBLIC or not (name.startswith("ji.") or in_table):
             continue
         link = addnodes.pending_xref(
-            "", refdomain="py", reftype="obj", reftarget=f"jimpact.{PUBLIC[name]}", refexplicit=True
+            "",
+            refdomain="py",
+            reftype="obj",
+            reftarget=f"jimpact.{PUBLIC[name]}",
+            refexplicit=True,
         )
         link["refdoc"] = app.env.docname
         literal.replace_self(link)

@@ -1,4 +1,6 @@
-"""Formulas of docstrings, written for a terminal, in the LaTeX that the site typesets."""
+"""Formulas of docstrings, written for a terminal, in the LaTeX that the site
+typesets.
+"""
 
 import re
 
@@ -6,7 +8,20 @@ from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 
 GREEK = (
-    *("alpha", "beta", "gamma", "delta", "eta", "theta", "lambda", "mu", "nu", "xi", "pi", "rho"),
+    *(
+        "alpha",
+        "beta",
+        "gamma",
+        "delta",
+        "eta",
+        "theta",
+        "lambda",
+        "mu",
+        "nu",
+        "xi",
+        "pi",
+        "rho",
+    ),
     *("sigma", "tau", "phi", "chi", "omega"),
     *("Gamma", "Delta", "Theta", "Lambda", "Xi", "Sigma", "Phi", "Omega"),
 )
@@ -14,11 +29,21 @@ FUNCTIONS = ["sin", "cos", "tan", "arccos", "exp", "ln", "log", "max", "min"]
 WORDS = {"grad": r"\nabla ", "in": r" \in ", "sum": r"\sum ", "pbar": r"{\bar p}"}
 KNOWN = {*GREEK, *FUNCTIONS, *WORDS}
 SIGNS = [  # longer ones first
-    ("_|_", r" \perp "), ("<=", r" \le "), (">=", r" \ge "), ("!=", r" \ne "), ("->", r" \to "),
-    ("+/-", r" \pm "), ("+=", r" {+}{=} "), ("{", r"\{"), ("}", r"\}"), ("~", r" \sim "),
-]  # fmt: skip
+    ("_|_", r" \perp "),
+    ("<=", r" \le "),
+    (">=", r" \ge "),
+    ("!=", r" \ne "),
+    ("->", r" \to "),
+    ("+/-", r" \pm "),
+    ("+=", r" {+}{=} "),
+    ("{", r"\{"),
+    ("}", r"\}"),
+    ("~", r" \sim "),
+]
 # a name, its index, primes, and a sign that ends it: before (-) or after (+) the impact
-NAME = re.compile(r"([A-Za-z]+)(?:_([A-Za-z]+\d*|\d+[a-z]*|\{[^}]*\}))?('*)([+-](?![\w(.]))?")
+NAME = re.compile(
+    r"([A-Za-z]+)(?:_([A-Za-z]+\d*|\d+[a-z]*|\{[^}]*\}))?('*)([+-](?![\w(.]))?"
+)
 
 
 def _letters(word: str) -> str:
@@ -33,7 +58,9 @@ def _letters(word: str) -> str:
         return f"q_{word[1]}"
     if word[0] == "d" and word[1:] in GREEK:
         return rf"d\{word[1:]} "
-    return word if len(word) < 3 else rf"\operatorname{{{word}}}"
+    if len(word) < 3:
+        return word
+    return rf"\operatorname{{{word}}}"
 
 
 def _closing(text: str, start: int) -> int:
@@ -52,14 +79,19 @@ def _name(match: re.Match[str]) -> str:
     base = _letters(word)
     if index is not None:
         inner = index.strip("{}")
-        inner = rf"\{inner} " if inner in GREEK else inner
-        base = rf"q_{{{word[1]},{inner}}}" if base.startswith("q_") else rf"{base}_{{{inner}}}"
+        if inner in GREEK:
+            inner = rf"\{inner} "
+        if base.startswith("q_"):
+            base = rf"q_{{{word[1]},{inner}}}"
+        else:
+            base = rf"{base}_{{{inner}}}"
     return base + primes + (f"^{{{sign}}}" if sign else "")
 
 
 def _translate(text: str) -> str:
     """LaTeX of a whole formula."""
-    parts, i = [], 0
+    parts = []
+    i = 0
     while i < len(text):
         root = text.startswith("sqrt(", i)
         if root or text.startswith("^(", i):
@@ -78,7 +110,9 @@ def _translate(text: str) -> str:
             parts.append(_name(match))
             i = match.end()
         else:
-            sign, tex = next((x for x in SIGNS if text.startswith(x[0], i)), (text[i], text[i]))
+            sign, tex = next(
+                (x for x in SIGNS if text.startswith(x[0], i)), (text[i], text[i])
+            )
             parts.append(tex)
             i += len(sign)
     return "".join(parts)
@@ -97,7 +131,9 @@ def tex(text: str) -> str | None:
     words = [x for x in re.findall(r"\b[a-z]{3,}\b", text) if x not in KNOWN]
     if len(words) > 1 or text in words:  # a sentence, a name
         return None
-    if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(r"[A-Za-z]", text):
+    if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(
+        r"[A-Za-z]", text
+    ):
         return None
     try:
         latex = _translate(text).strip()
@@ -125,4 +161,6 @@ def typeset(lines: list[str]) -> None:
 def _as_role(match: re.Match[str]) -> str:
     """A formula in backticks as a role of the site; other text unchanged."""
     formula = tex(match[1])
-    return match[0] if formula is None else f":math:`{formula}`"
+    if formula is None:
+        return match[0]
+    return f":math:`{formula}`"

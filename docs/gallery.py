@@ -1,6 +1,8 @@
-"""The pictures of the docs, each a function: `python docs/gallery.py [NAME ...]` draws them anew.
+"""The pictures of the docs, each a function: `python docs/gallery.py [NAME ...]` draws
+them anew.
 
-Run by hand, from a clone; `chart_three_balls` takes minutes. A docstring is the caption.
+Run by hand, from a clone; `chart_three_balls` takes minutes. A docstring is the
+caption.
 """
 
 import subprocess
@@ -16,7 +18,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
-from jimpact.plot.style import COLOURS, GREY, SMALL, legend_below, logarithmic, new_figure, styled
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    SMALL,
+    legend_below,
+    logarithmic,
+    new_figure,
+    styled,
+)
 
 PICTURES = Path(__file__).parent / "pictures"
 DRAWN: dict[str, Callable] = {}
@@ -32,17 +42,23 @@ def picture(function: Callable) -> Callable:
 
 @styled()
 def three_balls(
-    make: Callable, values: np.ndarray, label: str, log: bool = False, shares: bool = False
+    make: Callable,
+    values: np.ndarray,
+    label: str,
+    log: bool = False,
+    shares: bool = False,
 ) -> Figure:
-    """Velocities of three equal balls in a row after the first struck, against a parameter.
+    """Velocities of three equal balls in a row after the first struck, against a
+    parameter.
 
-    `make` takes the parameter, and returns the law, or law, scene and velocity. Grey: the status
-    is a failure. `shares`: velocities over the striker's.
+    `make` takes the parameter, and returns the law, or law, scene and velocity. Grey:
+    the status is a failure. `shares`: velocities over the striker's.
     """
 
     def outcome(x):
         made = make(x)
-        made = made if isinstance(made, tuple) else (made, CRADLE, STRIKER)
+        if not isinstance(made, tuple):
+            made = (made, CRADLE, STRIKER)
         out = ji.impact(*made)
         return out.velocity / (made[2][0] if shares else 1.0), out.status
 
@@ -50,7 +66,8 @@ def three_balls(
     failed = np.array([ji.STATUS[int(code)].failure for code in status])
     figure, axes = new_figure(3.4)
     for i in range(3):
-        style = {"color": COLOURS[i], "lw": 2, "ls": "--" if i == 2 else "-"}  # where they coincide
+        # where they coincide
+        style = {"color": COLOURS[i], "lw": 2, "ls": "--" if i == 2 else "-"}
         axes.plot(values, velocity[:, i], label=f"ball {i + 1}", **style)
     if failed.any():
         across = axes.get_xaxis_transform()
@@ -68,12 +85,15 @@ def three_balls(
     return figure
 
 
-# ------------------------------------------------------------------------------- one for each law
+# ------------------------------------------------------------------------------- one
+# for each law
 
 
 @picture
 def law_lzb():
-    """Three touching Hertz balls, e = 0.9: the stiffness ratio decides which one moves on."""
+    """Three touching Hertz balls, e = 0.9: the stiffness ratio decides which one moves
+    on.
+    """
     return three_balls(
         lambda ratio: ji.LZB(0.9, jnp.stack([1.0, ratio])),
         np.geomspace(0.1, 10, 121),
@@ -93,13 +113,17 @@ def running(law: ji.Law) -> Figure:
 
 @picture
 def law_newton():
-    """Newton's law, e = 0.5: where ball 3 runs away (> 0), it is pulled back, and flagged."""
+    """Newton's law, e = 0.5: where ball 3 runs away (> 0), it is pulled back, and
+    flagged.
+    """
     return running(ji.Newton(0.5))
 
 
 @picture
 def law_moreau():
-    """Moreau's law, e = 0.5: Newton's, until contact 2 would pull; then it takes no impulse."""
+    """Moreau's law, e = 0.5: Newton's, until contact 2 would pull; then it takes no
+    impulse.
+    """
     return running(ji.Moreau(0.5))
 
 
@@ -107,25 +131,33 @@ def law_moreau():
 def law_poisson():
     """Poisson's law, e1 = 0.4: only e2 > e1 parts the two targets."""
     return three_balls(
-        lambda e: ji.Poisson(jnp.stack([0.4, e])), np.linspace(0, 1, 101), "restitution e2"
+        lambda e: ji.Poisson(jnp.stack([0.4, e])),
+        np.linspace(0, 1, 101),
+        "restitution e2",
     )
 
 
 @picture
 def law_binary():
-    """Pair collisions: for small e the targets are struck again and again, and move together."""
+    """Pair collisions: for small e the targets are struck again and again, and move
+    together.
+    """
     return three_balls(ji.Binary, np.linspace(0, 1, 201), "restitution e")
 
 
 @picture
 def law_routh():
-    """Routh's increments, e = 0.5: where ball 3 runs away (> 0), contact 2 is left approaching."""
+    """Routh's increments, e = 0.5: where ball 3 runs away (> 0), contact 2 is left
+    approaching.
+    """
     return running(ji.Routh(0.5))
 
 
 @picture
 def law_impulse_correlation():
-    """Impulse correlation, e = 1: the ratio runs through all outcomes that conserve energy."""
+    """Impulse correlation, e = 1: the ratio runs through all outcomes that conserve
+    energy.
+    """
     return three_balls(
         lambda ratio: ji.ImpulseCorrelation(1.0, ratio),
         np.linspace(0.5, 1, 101),
@@ -137,7 +169,9 @@ def law_impulse_correlation():
 def law_restitution_matrix():
     """A matrix with e = 0.5 on its diagonal: the entry E21 shares out the velocity."""
     return three_balls(
-        lambda x: ji.RestitutionMatrix(jnp.array([[0.5, 0.0], [0.0, 0.5]]).at[1, 0].set(x)),
+        lambda x: ji.RestitutionMatrix(
+            jnp.array([[0.5, 0.0], [0.0, 0.5]]).at[1, 0].set(x)
+        ),
         np.linspace(-1, 2, 151),
         "matrix entry E21",
     )
@@ -145,8 +179,11 @@ def law_restitution_matrix():
 
 @picture
 def law_compliant():
-    """A heavy ball, struck from both sides: a gap of a tenth of its scale is as good as closed."""
-    law, before = ji.Compliant(ji.Hertz(1e9)), jnp.array([1.0, 0.0, -1.0])
+    """A heavy ball, struck from both sides: a gap of a tenth of its scale is as good as
+    closed.
+    """
+    law = ji.Compliant(ji.Hertz(1e9))
+    before = jnp.array([1.0, 0.0, -1.0])
     masses = [0.25, 1.0, 0.25]
     scale = ji.theory.gap_scale(ji.chain(masses), law, before).delta[1]
     return three_balls(
@@ -159,7 +196,9 @@ def law_compliant():
 
 @picture
 def law_velocity_dependent():
-    """LZB with an e that falls with the speed: slow shots lose nothing, fast ones much."""
+    """LZB with an e that falls with the speed: slow shots lose nothing, fast ones
+    much.
+    """
     law = ji.VelocityDependent(ji.LZB(0.8), speed_exponent=0.25, yield_speed=0.05)
     return three_balls(
         lambda speed: (law, CRADLE, speed * STRIKER),
@@ -170,33 +209,47 @@ def law_velocity_dependent():
     )
 
 
-# ------------------------------------------------------------------------------------- and others
+# -------------------------------------------------------------------------------------
+# and others
 
 
 @picture
 def compare_three_balls(path):
-    """All laws with one coefficient of restitution on a measured shot of three balls."""
+    """All laws with one coefficient of restitution on a measured shot of three
+    balls.
+    """
     subprocess.run(["jimpact", "compare", "--out", str(path)], check=True)
 
 
 @picture
 def force_histories():
-    """The force between the last two of five touching balls, three restitutions of LZB."""
-    balls, k = ji.chain([0.0667] * 5), 1.2e10  # steel balls of one inch
-    rows = {f"e = {e}": ji.history(ji.LZB(e, k), balls, [1.0, 0, 0, 0, 0]) for e in (1.0, 0.9, 0.7)}
+    """The force between the last two of five touching balls, three restitutions of
+    LZB.
+    """
+    # steel balls of one inch
+    balls = ji.chain([0.0667] * 5)
+    k = 1.2e10
+    rows = {
+        f"e = {e}": ji.history(ji.LZB(e, k), balls, [1.0, 0, 0, 0, 0])
+        for e in (1.0, 0.9, 0.7)
+    }
     return ji.plot.forces(rows)
 
 
 @picture
 def impact_history():
-    """Inside an impact by LZB: forces, gap velocities and stored energy of three steel balls."""
+    """Inside an impact by LZB: forces, gap velocities and stored energy of three steel
+    balls.
+    """
     law = ji.LZB(0.9, 1.2e10)
     return ji.plot.history(ji.history(law, ji.chain([0.0667] * 3), STRIKER))
 
 
 @picture
 def unseen_combination():
-    """One shot of three balls tells of restitution and stiffness ratio a region, not a point."""
+    """One shot of three balls tells of restitution and stiffness ratio a region, not a
+    point.
+    """
     shots = ji.Experiments(pre=[STRIKER], post=[[-0.07, 0.14, 0.93]], sigma=0.02)
     fit = ji.fit(ji.LZB(0.95, [1.0, 1.0]), CRADLE, shots)
     return ji.plot.contour(ji.contour(fit, "restitution", "stiffness[2]"))
@@ -206,22 +259,32 @@ def unseen_combination():
 def outcomes_and_laws():
     """Outcomes that mechanics allows for three balls, and where laws put theirs."""
     laws = {"Newton": ji.Newton(0.9), "Binary": ji.Binary(0.9), "LZB": ji.LZB(0.9)}
-    marked = {name: ji.impact(law, CRADLE, STRIKER).velocity for name, law in laws.items()}
+    marked = {
+        name: ji.impact(law, CRADLE, STRIKER).velocity for name, law in laws.items()
+    }
     return ji.plot.admissible_set(ji.theory.admissible_set(CRADLE, STRIKER), marked)
 
 
 @picture
 def gaps_decide():
-    """Three steel balls, the outer ones strike: gaps of up to 0.1 mm decide the outcome."""
-    law, balls = ji.Compliant(ji.Hertz(1.06e10)), ji.chain([0.0167, 0.0669, 0.0167])
-    before, gaps = [1.0, 0.0, -1.0], ji.Uniform(0.0, 100e-6)
+    """Three steel balls, the outer ones strike: gaps of up to 0.1 mm decide the
+    outcome.
+    """
+    law = ji.Compliant(ji.Hertz(1.06e10))
+    balls = ji.chain([0.0167, 0.0669, 0.0167])
+    before = [1.0, 0.0, -1.0]
+    gaps = ji.Uniform(0.0, 100e-6)
     result = ji.monte_carlo(law, balls, before, gaps=gaps, samples=20_000)
-    return ji.plot.monte_carlo(result, "Two balls strike a third one at 1 m/s, from both sides")
+    return ji.plot.monte_carlo(
+        result, "Two balls strike a third one at 1 m/s, from both sides"
+    )
 
 
 @picture
 def motion_cradle():
-    """Newton's cradle with three balls: angles, velocities, gaps and the energy ledger."""
+    """Newton's cradle with three balls: angles, velocities, gaps and the energy
+    ledger.
+    """
     system = ji.System(ji.PendulumCradle([0.1, 0.1, 0.1], 0.15, 0.0125), gravity=True)
     motion = ji.simulate(system, ji.LZB(0.95), [-0.5, 0, 0], [0.0, 0.0, 0.0], 8.0)
     return ji.plot.motion(motion, system=system)
@@ -229,8 +292,11 @@ def motion_cradle():
 
 @picture
 def rocking_dispersion():
-    """A rocking block: how much of the impact reaches the far corner, against the kinetic angle."""
-    mu, e = [0.0, 0.1, 0.3, 0.8], [0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
+    """A rocking block: how much of the impact reaches the far corner, against the
+    kinetic angle.
+    """
+    mu = [0.0, 0.1, 0.3, 0.8]
+    e = [0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
     found = ji.theory.rocking_dispersion(np.linspace(0.35, 4.5, 60), mu, e)
     return ji.plot.rocking_dispersion(found)
 
@@ -242,13 +308,16 @@ def chart_three_balls(path):
 
 
 def chart_of_a_box(contacts: int, turned: list[float], title: str) -> Figure:
-    """Error against time and work for a box that falls on its `contacts` lowest corners."""
+    """Error against time and work for a box that falls on its `contacts` lowest
+    corners.
+    """
     box = ji.Box([0.6, 0.4, 0.3])
     scene = box.scene(box.touching(np.array(turned) / np.linalg.norm(turned)))
     at = np.sort(np.argsort(scene.gaps)[:contacts])
     tangents = scene.tangents.reshape(6, 8, 2)[:, at].reshape(6, -1)
     closed = ji.Scene(scene.mass, scene.normals[:, at], tangents=tangents)
-    velocity, mu = [1.0, 0.3, -1.0, 0.5, -0.4, 0.2], 0.3
+    velocity = [1.0, 0.3, -1.0, 0.5, -0.4, 0.2]
+    mu = 0.3
     result = ji.work_precision(
         ji.LZB(0.3, friction=mu),
         closed,
@@ -266,19 +335,27 @@ def chart_of_a_box(contacts: int, turned: list[float], title: str) -> Figure:
 @picture
 def chart_box_corner():
     """Error against time and work: a box with friction that falls on a corner."""
-    return chart_of_a_box(1, [0.9, 0.3, 0.2, 0.1], "A box on a corner, e = 0.3, mu = 0.3")
+    return chart_of_a_box(
+        1, [0.9, 0.3, 0.2, 0.1], "A box on a corner, e = 0.3, mu = 0.3"
+    )
 
 
 @picture
 def chart_box_edge():
     """Error against time and work: a box with friction that falls on an edge."""
-    return chart_of_a_box(2, [0.95, 0.3, 0.0, 0.0], "A box on an edge, e = 0.3, mu = 0.3")
+    return chart_of_a_box(
+        2, [0.95, 0.3, 0.0, 0.0], "A box on an edge, e = 0.3, mu = 0.3"
+    )
 
 
 @picture
 def chart_box_flat():
-    """Error against time and work: a box with friction that falls flat on four corners."""
-    return chart_of_a_box(4, [1.0, 0.0, 0.0, 0.0], "A box flat on four corners, e = 0.3, mu = 0.3")
+    """Error against time and work: a box with friction that falls flat on four
+    corners.
+    """
+    return chart_of_a_box(
+        4, [1.0, 0.0, 0.0, 0.0], "A box flat on four corners, e = 0.3, mu = 0.3"
+    )
 
 
 @picture
@@ -289,8 +366,11 @@ def stability(path):
 
 @picture
 def force_chains():
-    """Impulses in a packing of 290 discs, some of which are smaller, that another disc strikes."""
-    rows, radius = 17, 0.5
+    """Impulses in a packing of 290 discs, some of which are smaller, that another disc
+    strikes.
+    """
+    rows = 17
+    radius = 0.5
     at = [(i + j % 2 / 2, j * np.sqrt(0.75)) for j in range(rows) for i in range(rows)]
     small = np.random.default_rng(1).random(len(at)) < 0.2
     at = np.array([*at, (rows // 2, rows * np.sqrt(0.75))]) + np.array([0, radius])
@@ -304,7 +384,8 @@ def force_chains():
     law = ji.LZB(0.9, method="implicit")
     out = ji.raise_on_failure(ji.impact(law, packing, velocity))
     title = (
-        f"{discs.count} discs, {packing.contacts} contacts: impulses of an impact from above (LZB)"
+        f"{discs.count} discs, {packing.contacts} contacts: impulses of an impact "
+        f"from above (LZB)"
     )
     return ji.plot.force_chains(discs, q, packing, out.impulse, title)
 
@@ -312,7 +393,9 @@ def force_chains():
 @picture
 @styled()
 def drops():
-    """Drops of a square: median error of the predicted angle after a hit, from two flights."""
+    """Drops of a square: median error of the predicted angle after a hit, from two
+    flights.
+    """
     with np.load(Path(__file__).parents[1] / "tests" / "held" / "drops.npz") as stored:
         curves = {name: stored[name] for name in stored.files}
     figure, panels = new_figure(3.0, "", 1, 2, sharey=True)
@@ -327,7 +410,8 @@ def drops():
     return figure
 
 
-# An engine of each group -> where its label stands (energy ratio, dispersion), what it begins with
+# An engine of each group -> where its label stands (energy ratio, dispersion), what it
+# begins with
 ENGINE_LABELS = {
     ("siconos", "MoreauJeanOSI, step 10 ms"): (1.07, 0.40, "all contacts at once: "),
     ("chipmunk", "step 1/60 s, 1 m/s"): (0.53, 1.58, "one contact after another: "),
@@ -344,7 +428,11 @@ ENGINE_LABELS = {
     ("mujoco", "default solref and solimp, step 2 ms"): (0.45, 0.28, "soft contacts: "),
     ("pybullet", "step 1/2400 s"): (0.82, 0.38, ""),
     ("newton-XPBD", "step 1/60 s"): (0.51, 0.47, ""),
-    ("drake", "SAP, dissipation 0, relaxation time 0, step .1 ms"): (0.64, 1.16, "step .1 ms: "),
+    ("drake", "SAP, dissipation 0, relaxation time 0, step .1 ms"): (
+        0.64,
+        1.16,
+        "step .1 ms: ",
+    ),
 }
 
 
@@ -355,14 +443,21 @@ def energy_and_dispersion(velocity: np.ndarray) -> np.ndarray:
 
 
 def engine_groups() -> list[tuple[np.ndarray, str, tuple[float, float]]]:
-    """Point, label and its place for each group of engines; every row is in the nearest one."""
-    rows = {(row.engine, row.setting): row for row in ji.data.engine_impacts(scene="S1").rows}
+    """Point, label and its place for each group of engines; every row is in the nearest
+    one.
+    """
+    rows = {
+        (row.engine, row.setting): row
+        for row in ji.data.engine_impacts(scene="S1").rows
+    }
     points = energy_and_dispersion([row.velocity for row in rows.values()])
     centres = energy_and_dispersion([rows[key].velocity for key in ENGINE_LABELS])
     nearest = np.linalg.norm(points[:, None] - centres, axis=2).argmin(1)
     groups = []
     for k, (x, y, head) in enumerate(ENGINE_LABELS.values()):
-        names = dict.fromkeys(engine for (engine, _), group in zip(rows, nearest) if group == k)
+        names = dict.fromkeys(
+            engine for (engine, _), group in zip(rows, nearest) if group == k
+        )
         groups.append((centres[k], head + ", ".join(names), (x, y)))
     return groups
 
@@ -370,7 +465,9 @@ def engine_groups() -> list[tuple[np.ndarray, str, tuple[float, float]]]:
 @picture
 @styled()
 def engines() -> Figure:
-    """Three balls at e = 1: what thirty engines make of them, beside laws and a measured shot."""
+    """Three balls at e = 1: what thirty engines make of them, beside laws and a
+    measured shot.
+    """
     figure, axes = new_figure(6.4)
     laws = {
         "Moreau": ji.Moreau,
@@ -379,19 +476,30 @@ def engines() -> Figure:
         "LZB, linear springs": lambda e: ji.LZB(e, exponent=1.0),
     }
     for k, (name, make) in enumerate(laws.items()):
-        run = jax.jit(jax.vmap(lambda e, make=make: ji.impact(make(e), CRADLE, STRIKER).velocity))
+        run = jax.jit(
+            jax.vmap(lambda e, make=make: ji.impact(make(e), CRADLE, STRIKER).velocity)
+        )
         line = energy_and_dispersion(run(jnp.linspace(0.1, 1, 91)))
-        axes.plot(*line.T, color=COLOURS[k], lw=1.4, label=f"{name}, e from .1 to 1", zorder=0)
+        axes.plot(
+            *line.T, color=COLOURS[k], lw=1.4, label=f"{name}, e from .1 to 1", zorder=0
+        )
     for point, text, place in engine_groups():
         axes.plot(*point, "o", color="black", ms=4)
         words = textwrap.fill(text, 32, break_on_hyphens=False)
         style = {"fontsize": SMALL, "va": "center", "ha": "left"}
         arrow = {"arrowstyle": "-", "color": GREY, "lw": 0.6, "shrinkB": 3}
         axes.annotate(words, point, place, arrowprops=arrow, **style)
-    measured = ji.read_experiments(files("jimpact") / "data" / "three_balls.csv").post[0]
-    axes.plot(*energy_and_dispersion(measured), "*", color=COLOURS[5], ms=12, label="measured")
+    measured = ji.read_experiments(files("jimpact") / "data" / "three_balls.csv").post[
+        0
+    ]
+    axes.plot(
+        *energy_and_dispersion(measured), "*", color=COLOURS[5], ms=12, label="measured"
+    )
     axes.set(xlim=(0.2, 1.55), ylim=(-0.05, 1.65))
-    axes.set(xlabel="energy ratio K_ER = T+/T-", ylabel="energy dispersion C_KE (0: equal shares)")
+    axes.set(
+        xlabel="energy ratio K_ER = T+/T-",
+        ylabel="energy dispersion C_KE (0: equal shares)",
+    )
     legend_below(figure, 3)
     return figure
 
@@ -399,8 +507,11 @@ def engines() -> Figure:
 @picture
 @styled()
 def oblique_rebounds() -> Figure:
-    """A sphere obliquely on a plane: its tangential spring returns slip at small angles."""
-    normals, tangents = [[0.0], [1.0], [0.0]], [[1.0], [0.0], [1.0]]
+    """A sphere obliquely on a plane: its tangential spring returns slip at small
+    angles.
+    """
+    normals = [[0.0], [1.0], [0.0]]
+    tangents = [[1.0], [0.0], [1.0]]
     sphere = ji.Scene([1.0, 1.0, 0.4], normals, tangents=tangents)
     angles = np.radians(np.linspace(0.5, 80.0, 160))
     before = np.stack([np.sin(angles), -np.cos(angles), 0 * angles], axis=1)
@@ -409,11 +520,17 @@ def oblique_rebounds() -> Figure:
         law = ji.LZB(0.95, friction=0.15, tangential_stiffness=kappa)
         run = jax.jit(jax.vmap(lambda v, law=law: ji.impact(law, sphere, v).velocity))
         slip = run(before) @ np.asarray(tangents)[:, 0]
-        label = "Coulomb alone" if kappa is None else f"kappa = {kappa}"
+        if kappa is None:
+            label = "Coulomb alone"
+        else:
+            label = f"kappa = {kappa}"
         axes.plot(np.tan(angles), slip / np.cos(angles), label=label)
     axes.axhline(0.0, color=GREY, lw=0.6)
     axes.set(xlim=(0, 2.0), ylim=(-0.5, 1.0))
-    axes.set(xlabel="tangent of the angle of incidence", ylabel="slip after, over the approach")
+    axes.set(
+        xlabel="tangent of the angle of incidence",
+        ylabel="slip after, over the approach",
+    )
     legend_below(figure, 4)
     return figure
 
@@ -422,7 +539,8 @@ def main(names: list[str]) -> None:
     """Draw these, or all."""
     jax.config.update("jax_enable_x64", True)
     for name in names or DRAWN:
-        path, draw = PICTURES / f"{name}.png", DRAWN[name]
+        path = PICTURES / f"{name}.png"
+        draw = DRAWN[name]
         if draw.__code__.co_argcount:
             draw(path)
         else:

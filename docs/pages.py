@@ -1,7 +1,7 @@
 """Pages of the site that are generated: laws, API, constants, gallery, lists.
 
-`conf.py` writes them into docs/generated before Sphinx reads the pages. Nothing here needs Sphinx,
-so the default tests check the texts, too.
+`conf.py` writes them into docs/generated before Sphinx reads the pages. Nothing here
+needs Sphinx, so the default tests check the texts, too.
 """
 
 import ast
@@ -21,9 +21,11 @@ DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 GENERATED = DOCS / "generated"
 
-# ------------------------------------------------------------------------------------ the API
+# ------------------------------------------------------------------------------------
+# the API
 
-API = {  # a page, and the modules whose public names it holds: the longest match decides
+# a page, and the modules whose public names it holds: the longest match decides
+API = {
     "Impacts": ("core.impacts", "core.audits", "laws.histories", "tools"),
     "Scenes": (
         "core.scene",
@@ -45,8 +47,12 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
 }
 
 DATA = {
-    "REGISTRY": "All laws by name: `REGISTRY[name].law` is the class. `register` adds a law.",
-    "data.ENGINE_SCENES": "Scenes of `engine_impacts` by name: masses [kg], wall, the e asked for.",
+    "REGISTRY": (
+        "All laws by name: `REGISTRY[name].law` is the class. `register` adds a law."
+    ),
+    "data.ENGINE_SCENES": (
+        "Scenes of `engine_impacts` by name: masses [kg], wall, the e asked for."
+    ),
     "STATUS": "Rows `(name, message, failure)` of the status codes, listed below.",
 }
 
@@ -54,12 +60,18 @@ DATA = {
 def public_names() -> dict[str, list[str]]:
     """Public names by page, from the stubs that list them."""
     pages: dict[str, list[str]] = {title: [] for title in API}
-    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data."),
-                            ("tracks", "tracks.")):  # fmt: skip
+    for package, prefix in (
+        ("", ""),
+        ("plot", "plot."),
+        ("theory", "theory."),
+        ("data", "data."),
+        ("tracks", "tracks."),
+    ):
         stub = ROOT / "jimpact" / package / "__init__.pyi"
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
             if isinstance(line, ast.ImportFrom) and line.module:
-                module, names = line.module, [alias.name for alias in line.names]
+                module = line.module
+                names = [alias.name for alias in line.names]
             else:
                 continue
             for name in names:
@@ -71,7 +83,9 @@ def public_names() -> dict[str, list[str]]:
                     if place.startswith(start + ".") or place == start
                 ]
                 if not matches:
-                    raise ValueError(f"API must have a page for {place}: see docs/pages.py")
+                    raise ValueError(
+                        f"API must have a page for {place}: see docs/pages.py"
+                    )
                 pages[max(matches)[1]].append(prefix + name)
     return pages
 
@@ -101,7 +115,8 @@ def in_table(text: str) -> str:
 def names_page() -> str:
     """`docs/names.md`: every public name in one line, by task."""
     top = (
-        "Every public name, by task, as `import jimpact as ji` shows it. Classes of results are "
+        "Every public name, by task, as `import jimpact as ji` shows it. Classes of "
+        "results are "
         "described on the pages of the functions that return them."
     )
     text = ["<!-- written by `python docs/pages.py` -->", "", "# Names", "", top, ""]
@@ -115,12 +130,19 @@ def names_page() -> str:
 
 def results_of(names: list[str]) -> dict[str, type]:
     """Classes without a public name that these functions return, by module and name."""
-    public = {attrgetter(name)(ji) for names in public_names().values() for name in names
-              if name not in DATA}  # fmt: skip
+    public = {
+        attrgetter(name)(ji)
+        for names in public_names().values()
+        for name in names
+        if name not in DATA
+    }
     found = {}
     for name in names:
         value = DATA.get(name) or attrgetter(name)(ji)
-        returns = [inspect.signature(value).return_annotation] if inspect.isfunction(value) else []
+        if inspect.isfunction(value):
+            returns = [inspect.signature(value).return_annotation]
+        else:
+            returns = []
         for kind in (part for each in returns for part in (get_args(each) or (each,))):
             kind = get_origin(kind) or kind
             ours = inspect.isclass(kind) and kind.__module__.startswith("jimpact.")
@@ -133,7 +155,8 @@ def api_pages() -> dict[str, str]:
     """A page for each group of public names, and their list."""
     laws = law_names()
     index = ["# API", "", "[Names](../../names.md) lists all of them.", ""]
-    pages, described = {}, set()
+    pages = {}
+    described = set()
     for title, names in public_names().items():
         text = [f"# {title}", ""]
         for name in names:
@@ -141,10 +164,18 @@ def api_pages() -> dict[str, str]:
                 text += [f"- [`ji.{name}`](../laws/{laws[name]}.md): its own page", ""]
                 continue
             if name in DATA:
-                text += ["```{eval-rst}", f".. py:data:: jimpact.{name}", "", f"   {DATA[name]}"]
+                text += [
+                    "```{eval-rst}",
+                    f".. py:data:: jimpact.{name}",
+                    "",
+                    f"   {DATA[name]}",
+                ]
                 text += ["```", ""]
                 continue
-            kind = "class" if isinstance(attrgetter(name)(ji), type) else "function"
+            if isinstance(attrgetter(name)(ji), type):
+                kind = "class"
+            else:
+                kind = "function"
             text += ["```{eval-rst}", f".. auto{kind}:: jimpact.{name}"]
             if kind == "class":
                 text.append("   :members:")
@@ -152,11 +183,24 @@ def api_pages() -> dict[str, str]:
         results = sorted(results_of(names).keys() - described)
         described.update(results)
         for place in results:
-            text += ["```{eval-rst}", f".. autoclass:: {place}", "   :members:", "```", ""]
+            text += [
+                "```{eval-rst}",
+                f".. autoclass:: {place}",
+                "   :members:",
+                "```",
+                "",
+            ]
         if title == "Impacts":
             text += status_table()
         pages[f"api/{slug(title)}.md"] = "\n".join(text)
-    toctree = ["```{toctree}", ":hidden:", "", *[slug(title) for title in API], "```", ""]
+    toctree = [
+        "```{toctree}",
+        ":hidden:",
+        "",
+        *[slug(title) for title in API],
+        "```",
+        "",
+    ]
     pages["api/index.md"] = "\n".join([*index, *toctree])
     return pages
 
@@ -167,7 +211,12 @@ def status_table() -> list[str]:
         f"| {code} | `{x.name}` | {'yes' if x.failure else ''} | {x.message} |"
         for code, x in enumerate(ji.STATUS)
     ]
-    head = ["## Status codes", "", "| code | name | failure | meaning |", "|---|---|---|---|"]
+    head = [
+        "## Status codes",
+        "",
+        "| code | name | failure | meaning |",
+        "|---|---|---|---|",
+    ]
     return [*head, *rows, ""]
 
 
@@ -179,23 +228,41 @@ def law_pages() -> dict[str, str]:
         promises = ", ".join(sorted(row.promises)).replace("_", " ") or "none"
         keys = ", ".join(f"`{x}`" for x in row.parameters)
         text = [
-            f"# {law}", "", f"{row.summary[0].upper()}{row.summary[1:]}.", "",
-            f"Right when\n: {row.right_when}", "",
-            f"Fails when\n: {row.fails_when}", "",
-            f"Promises on every scene\n: {promises}", "",
-            f"In a study\n: `[law]` `name = \"{name}\"`; {keys}", "",
-            f"Source\n: {row.source}", "",
+            f"# {law}",
+            "",
+            f"{row.summary[0].upper()}{row.summary[1:]}.",
+            "",
+            f"Right when\n: {row.right_when}",
+            "",
+            f"Fails when\n: {row.fails_when}",
+            "",
+            f"Promises on every scene\n: {promises}",
+            "",
+            f'In a study\n: `[law]` `name = "{name}"`; {keys}',
+            "",
+            f"Source\n: {row.source}",
+            "",
             *picture_of(f"law_{name}"),
-            "```{eval-rst}", f".. autoclass:: jimpact.{law}", "```", "",
-            "## To cite", "", "```bibtex", row.bibtex.strip(), "```", "",
-        ]  # fmt: skip
+            "```{eval-rst}",
+            f".. autoclass:: jimpact.{law}",
+            "```",
+            "",
+            "## To cite",
+            "",
+            "```bibtex",
+            row.bibtex.strip(),
+            "```",
+            "",
+        ]
         pages[f"laws/{name}.md"] = "\n".join(text)
     return pages
 
 
-# ---------------------------------------------------------------------------- the constants
+# ---------------------------------------------------------------------------- the
+# constants
 
-UNITS = (  # words of a comment that state a unit, and the unit; None: the words themselves
+# words of a comment that state a unit, and the unit; None: the words themselves
+UNITS = (
     (r"\[([^\]]+)\]", None),
     (r"^(m/s\^2)", None),
     (r"^(?:(?:of|in) )?(?:the )?tolerances?\b", "tolerance"),
@@ -207,9 +274,12 @@ UNITS = (  # words of a comment that state a unit, and the unit; None: the words
 
 def numbers_in(value: ast.expr) -> bool:
     """Whether an expression is made of numbers that somebody chose."""
-    made_by_calls = [x for x in ast.walk(value) if isinstance(x, ast.Call | ast.comprehension)]
+    made_by_calls = [
+        x for x in ast.walk(value) if isinstance(x, ast.Call | ast.comprehension)
+    ]
     if any(
-        getattr(getattr(x, "func", None), "id", "") != "MappingProxyType" for x in made_by_calls
+        getattr(getattr(x, "func", None), "id", "") != "MappingProxyType"
+        for x in made_by_calls
     ):
         return False
     return not isinstance(value, ast.Subscript) and any(
@@ -221,10 +291,12 @@ def numbers_in(value: ast.expr) -> bool:
 
 
 def constants_of(path: Path) -> list[tuple[str, str, str]]:
-    """(name, value, comment) of the numbers bound to NAMES_IN_CAPITALS at the top of a module.
+    """(name, value, comment) of the numbers bound to NAMES_IN_CAPITALS at the top of a
+    module.
 
-    The comment is the one at the end of the line and the one on the lines above; constants that
-    follow each other without a comment of their own share the one above the first.
+    The comment is the one at the end of the line and the one on the lines above;
+    constants that follow each other without a comment of their own share the one above
+    the first.
     """
     source = path.read_text(encoding="utf-8")
     comments = {
@@ -233,7 +305,9 @@ def constants_of(path: Path) -> list[tuple[str, str, str]]:
         if token.type == tokenize.COMMENT and not token.string.startswith("# ---")
     }
     lines = source.splitlines()
-    rows, last_line, shared = [], -1, ""
+    rows = []
+    last_line = -1
+    shared = ""
     for node in ast.parse(source).body:
         if isinstance(node, ast.Assign):
             targets = node.targets
@@ -242,24 +316,34 @@ def constants_of(path: Path) -> list[tuple[str, str, str]]:
         else:
             continue
         names = [x.id for t in targets for x in ast.walk(t) if isinstance(x, ast.Name)]
-        if not names or not all(x.isupper() for x in names) or not numbers_in(node.value):
+        if (
+            not names
+            or not all(x.isupper() for x in names)
+            or not numbers_in(node.value)
+        ):
             continue
-        if len(names) > 1 and not isinstance(node.value, ast.Constant):  # codes: 0, 1, 2
+        # codes: 0, 1, 2
+        if len(names) > 1 and not isinstance(node.value, ast.Constant):
             continue
         end = node.end_lineno
-        above, row = [], node.lineno - 1
+        above = []
+        row = node.lineno - 1
         while row in comments and lines[row - 1].lstrip().startswith("#"):
             above.insert(0, comments[row])
             row -= 1
         same_line = [comments[k] for k in range(node.lineno, end + 1) if k in comments]
-        same_line = [x for x in same_line if not x.startswith(("fmt:", "noqa", "type:"))]
+        same_line = [
+            x for x in same_line if not x.startswith(("fmt:", "noqa", "type:"))
+        ]
         if not above and not same_line and row == last_line:
             above = [shared]
-        comment = (
-            " ".join([*same_line, *above]) if node.lineno == end else " ".join([*above, *same_line])
-        )
+        if node.lineno == end:
+            comment = " ".join([*same_line, *above])
+        else:
+            comment = " ".join([*above, *same_line])
         rows.append((", ".join(names), ast.unparse(node.value), comment))
-        last_line, shared = end, " ".join(above)
+        last_line = end
+        shared = " ".join(above)
     return rows
 
 
@@ -268,7 +352,9 @@ def unit_of(comment: str) -> str:
     for pattern, unit in UNITS:
         match = re.search(pattern, comment)
         if match:
-            return match[1] if unit is None else unit
+            if unit is None:
+                return match[1]
+            return unit
     return ""
 
 
@@ -289,33 +375,52 @@ def constants() -> dict[str, list[tuple[str, str, str]]]:
 def constants_page() -> dict[str, str]:
     """Every number that somebody chose, with what it means."""
     text = [
-        "# Constants", "",
-        "Every number bound to a name in capitals at the top of a module, with its comment in the "
-        "source. Values are SI where nothing else is stated; `eps` is the rounding unit of the "
-        "precision in use. A constant without a unit is a count, or its meaning states the unit. "
-        "Coefficients of published Runge-Kutta methods are left out.", "",
-    ]  # fmt: skip
+        "# Constants",
+        "",
+        "Every number bound to a name in capitals at the top of a module, with its "
+        "comment in the "
+        "source. Values are SI where nothing else is stated; `eps` is the rounding "
+        "unit of the "
+        "precision in use. A constant without a unit is a count, or its meaning states "
+        "the unit. "
+        "Coefficients of published Runge-Kutta methods are left out.",
+        "",
+    ]
     room = None
     for path, rows in constants().items():
-        folder = path.split("/")[0] if "/" in path else "top level"
+        if "/" in path:
+            folder = path.split("/")[0]
+        else:
+            folder = "top level"
         if folder != room:
             text += ["", f"## {folder}", "", "| name | value | unit | meaning | file |"]
             text.append("|---|---|---|---|---|")
             room = folder
         for name, value, comment in rows:
-            shown = value if len(value) <= 60 else value[:57] + "..."
+            if len(value) <= 60:
+                shown = value
+            else:
+                shown = value[:57] + "..."
             meaning = in_table(re.sub(r"^\[[^\]]+\][,:;]? *", "", comment))
             meaning = re.sub(r"([<>*_$\[\]{}])", r"\\\1", meaning)
             file = path.split("/", 1)[-1]
-            columns = (f"`{name}`", f"`{in_table(shown)}`", unit_of(comment), meaning, f"`{file}`")
+            columns = (
+                f"`{name}`",
+                f"`{in_table(shown)}`",
+                unit_of(comment),
+                meaning,
+                f"`{file}`",
+            )
             text.append(f"| {' | '.join(columns)} |")
     text.append("")
     return {"constants.md": "\n".join(text)}
 
 
-# --------------------------------------------------------------------------------- the rooms
+# --------------------------------------------------------------------------------- the
+# rooms
 
-ROOMS = (  # from above: (name, task); a room imports from rows below its own, and from itself
+# from above: (name, task); a room imports from rows below its own, and from itself
+ROOMS = (
     (("cli", "commands"), ("saved", "saved results")),
     (("fits", "fits, verdicts"), ("methods", "comparison, charts")),
     (
@@ -325,7 +430,10 @@ ROOMS = (  # from above: (name, task); a room imports from rows below its own, a
         ("tracks", "tracks to shots"),
         ("data", "measurements"),
     ),
-    (("shots", "measured shots and their files"), ("plot", "style of pictures, `ji.plot`")),
+    (
+        ("shots", "measured shots and their files"),
+        ("plot", "style of pictures, `ji.plot`"),
+    ),
     (("laws", "one file for each law"),),
     (("events", "impact dynamics"), ("bodies", "gaps, tangents, mass")),
     (("core", "scene, contact, law, impact, audit, registry"),),
@@ -337,12 +445,18 @@ STATED = ("core", "events", "bodies", "laws")
 
 
 def rooms_svg() -> str:
-    """The rooms of the package, stacked; colours are those of the page, light or dark."""
-    width, height, gap = 640, 40, 8
+    """The rooms of the package, stacked; colours are those of the page, light or
+    dark.
+    """
+    width = 640
+    height = 40
+    gap = 8
     total = len(ROOMS) * (height + gap) + 4
-    ink, line = "var(--color-foreground-primary)", "var(--color-brand-primary)"
+    ink = "var(--color-foreground-primary)"
+    line = "var(--color-brand-primary)"
     parts = [
-        f'<svg viewBox="0 0 {width} {total}" role="img" style="max-width:{width}px;width:100%" '
+        f'<svg viewBox="0 0 {width} {total}" role="img" '
+        f'style="max-width:{width}px;width:100%" '
         'aria-label="Rooms of the package, each resting on those below it">'
     ]
     for row, rooms in enumerate(ROOMS):
@@ -351,34 +465,52 @@ def rooms_svg() -> str:
         for column, (room, task) in enumerate(rooms):
             x = 2 + column * (each + gap)
             parts.append(
-                f'<rect x="{x:.0f}" y="{y}" width="{each:.0f}" height="{height}" rx="5" '
+                f'<rect x="{x:.0f}" y="{y}" width="{each:.0f}" height="{height}" '
+                'rx="5" '
                 f'fill="var(--color-background-secondary)" stroke="{line}"/>'
-                f'<text x="{x + each / 2:.0f}" y="{y + 17}" text-anchor="middle" font-size="14" '
+                f'<text x="{x + each / 2:.0f}" y="{y + 17}" '
+                'text-anchor="middle" font-size="14" '
                 f'font-weight="600" fill="{ink}">{room}</text>'
-                f'<text x="{x + each / 2:.0f}" y="{y + 33}" text-anchor="middle" font-size="12" '
+                f'<text x="{x + each / 2:.0f}" y="{y + 33}" '
+                'text-anchor="middle" font-size="12" '
                 f'fill="{ink}">{task}</text>'
             )
     parts.append("</svg>")
     return "\n".join(parts) + "\n"
 
 
-# ----------------------------------------------------------------- pictures, notebooks, writing
+# ----------------------------------------------------------------- pictures, notebooks,
+# writing
 
 
 def pictures() -> dict[str, str]:
     """Name and caption of each picture: the functions of `gallery.py`."""
     tree = ast.parse((DOCS / "gallery.py").read_text(encoding="utf-8"))
-    made = [x for x in tree.body if isinstance(x, ast.FunctionDef)
-            and any(ast.unparse(y) == "picture" for y in x.decorator_list)]  # fmt: skip
+    made = [
+        x
+        for x in tree.body
+        if isinstance(x, ast.FunctionDef)
+        and any(ast.unparse(y) == "picture" for y in x.decorator_list)
+    ]
     return {x.name: " ".join((ast.get_docstring(x) or "").split()) for x in made}
 
 
 def picture_of(name: str) -> list[str]:
-    """A picture that links to its code in the gallery; nothing where there is no such picture."""
+    """A picture that links to its code in the gallery; nothing where there is no such
+    picture.
+    """
     caption = pictures().get(name)
-    return [] if caption is None else [
-        f":::{{figure}} ../../pictures/{name}.png", f":target: ../gallery.html#{anchor(name)}",
-        f":alt: {caption}", "", caption, ":::", ""]  # fmt: skip
+    if caption is None:
+        return []
+    return [
+        f":::{{figure}} ../../pictures/{name}.png",
+        f":target: ../gallery.html#{anchor(name)}",
+        f":alt: {caption}",
+        "",
+        caption,
+        ":::",
+        "",
+    ]
 
 
 def anchor(name: str) -> str:
@@ -388,33 +520,73 @@ def anchor(name: str) -> str:
 
 def gallery_page() -> dict[str, str]:
     """All pictures in a grid; each links to its code below."""
-    grid, code = ["::::{grid} 1 2 2 3", ":gutter: 3", ""], []
+    grid = ["::::{grid} 1 2 2 3", ":gutter: 3", ""]
+    code = []
     for name, caption in pictures().items():
         law = ji.REGISTRY.get(name.removeprefix("law_"))
-        title = law.law.__name__ if law else name.replace("_", " ").capitalize()
+        if law:
+            title = law.law.__name__
+        else:
+            title = name.replace("_", " ").capitalize()
         file = f"../pictures/{name}.png"
-        grid += [f":::{{grid-item-card}} {title}", f":img-top: {file}", f":img-alt: {caption}",
-                 f":link: {name}", ":link-type: ref", ":::", ""]  # fmt: skip
-        code += [f"({name})=", f"## {title}", "", caption, "", f"![{caption}]({file})", "",
-                 "```{literalinclude} ../gallery.py", ":language: python",
-                 f":pyobject: {name}", "```", ""]  # fmt: skip
-    top = ["# Gallery", "", "Each picture links to its code. To draw one again, run "
-           "`python docs/gallery.py NAME` in a clone.", ""]  # fmt: skip
+        grid += [
+            f":::{{grid-item-card}} {title}",
+            f":img-top: {file}",
+            (f":img-alt: {caption}"),
+            f":link: {name}",
+            ":link-type: ref",
+            ":::",
+            "",
+        ]
+        code += [
+            f"({name})=",
+            f"## {title}",
+            "",
+            caption,
+            "",
+            f"![{caption}]({file})",
+            "",
+            "```{literalinclude} ../gallery.py",
+            ":language: python",
+            f":pyobject: {name}",
+            "```",
+            "",
+        ]
+    top = [
+        "# Gallery",
+        "",
+        "Each picture links to its code. To draw one again, run "
+        "`python docs/gallery.py NAME` in a clone.",
+        "",
+    ]
     return {"gallery.md": "\n".join([*top, *grid, "::::", "", *code])}
 
 
 def notebooks_page() -> dict[str, str]:
     """The course of notebooks, in order."""
     names = sorted(x.stem for x in (ROOT / "notebooks").glob("*.ipynb"))
-    text = ["# Notebooks", "", "One course, in the folder `notebooks/`. The tests run the "
-            "notebooks; this site shows their stored outputs.", "", "```{toctree}",
-            ":maxdepth: 1", "", *names, "```", ""]  # fmt: skip
+    text = [
+        "# Notebooks",
+        "",
+        "One course, in the folder `notebooks/`. The tests run "
+        "the "
+        "notebooks; this site shows their stored outputs.",
+        "",
+        "```{toctree}",
+        ":maxdepth: 1",
+        "",
+        *names,
+        "```",
+        "",
+    ]
     return {"notebooks/index.md": "\n".join(text)}
 
 
 def write() -> None:
     """Write the pages that changed, so that Sphinx builds only those again."""
-    pages = law_pages() | api_pages() | constants_page() | gallery_page() | notebooks_page()
+    pages = (
+        law_pages() | api_pages() | constants_page() | gallery_page() | notebooks_page()
+    )
     pages["rooms.svg"] = rooms_svg()
     for name, text in pages.items():
         path = GENERATED / name

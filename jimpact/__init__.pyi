@@ -1,4 +1,4 @@
-"""Public names and where they live: read by type checkers, and on import by `lazy_loader`."""
+"""Public names and where they live: for type checkers, and for `lazy_loader`."""
 
 from . import data as data, plot as plot, theory as theory, tracks as tracks
 from .bodies.assembly import Bodies as Bodies
@@ -20,8 +20,16 @@ from .bodies.shapes import (
 from .cli.study import read_study as read_study
 from .core.audits import audit as audit, summary as summary
 from .core.contact import Contact as Contact, delassus_matrix as delassus_matrix
-from .core.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
-from .core.impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
+from .core.distributions import (
+    Normal as Normal,
+    RandomLaw as RandomLaw,
+    Uniform as Uniform,
+)
+from .core.impacts import (
+    Impact as Impact,
+    impact as impact,
+    raise_on_failure as raise_on_failure,
+)
 from .core.law import (
     Impulses as Impulses,
     Law as Law,

@@ -9,10 +9,11 @@ from jimpact.motion.record import Motion, read_motion
 
 
 def load(path: str | Path) -> Fit[Any] | Motion:
-    """Read the fit or the motion that `Fit.save` or `Motion.save` wrote, to the last digit.
+    """Read the fit or the motion that `Fit.save` or `Motion.save` wrote.
 
-    The classes of laws and scenes of a fit are imported by name, so read only files that you trust.
-    The file of a motion, or of a batch, does not hold its system and law.
+    The classes of laws and scenes of a fit are imported by name, so read only files
+    that you trust. The file of a motion, or of a batch, does not hold its system and
+    law.
 
     Args:
         path: the file.
@@ -21,13 +22,16 @@ def load(path: str | Path) -> Fit[Any] | Motion:
         `Fit` or `Motion`.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: neither a fit nor a motion, one of another
-            format, a law that cannot be imported, or a motion in double precision while JAX is in
-            single precision. (A fit stays in its own precision.)
+        FileNotFoundError: no such file. ValueError: neither a fit nor a motion, one of
+            another format, a law that cannot be imported, or a motion in double
+            precision while JAX is in single precision. (A fit stays in its own
+            precision.)
 
     >>> import pathlib, tempfile, jimpact as ji
     >>> folder = pathlib.Path(tempfile.mkdtemp())
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> data = ji.Experiments(
+    ...     [[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02
+    ... )
     >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
     >>> ji.load(fit.save(folder / "fit.json")).verdict == fit.verdict
     True
@@ -40,4 +44,6 @@ def load(path: str | Path) -> Fit[Any] | Motion:
     """
     path = Path(path)
     is_motion = path.suffix == ".npz" or zipfile.is_zipfile(path)
-    return read_motion(path) if is_motion else load_fit(path)
+    if is_motion:
+        return read_motion(path)
+    return load_fit(path)

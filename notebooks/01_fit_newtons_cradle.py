@@ -171,14 +171,20 @@ intervals = np.array([fit.confidence_interval(0.95) for fit in fits])
 inside = (intervals[:, :, 0] <= true_value) & (true_value <= intervals[:, :, 1])
 values = np.array([fit.value for fit in fits])
 stated = np.array([fit.standard_error for fit in fits])
-print(f"{repeats} simulated experiments, all converged: {all(fit.converged for fit in fits)}")
-print("parameter        true    mean   scatter  stated error  coverage of the 95 % interval")
+print(
+    f"{repeats} simulated experiments, all converged: {all(fit.converged for fit in fits)}"
+)
+print(
+    "parameter        true    mean   scatter  stated error  coverage of the 95 % interval"
+)
 for i, name in enumerate(fits[0].names):
     print(
         f"{name:15s} {true_value[i]:5.2f} {values[:, i].mean():7.4f} {values[:, i].std(ddof=1):8.4f}"
         f" {np.median(stated[:, i]):12.4f} {100 * inside[:, i].mean():10.1f} %"
     )
-assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.035)  # three standard deviations of a count
+assert np.all(
+    np.abs(inside.mean(axis=0) - 0.95) < 0.035
+)  # three standard deviations of a count
 
 # %%
 figure = Figure(figsize=(8, 2.8), layout="constrained")
@@ -200,10 +206,15 @@ figure
 
 # %%
 binary = ji.fit(ji.Binary(0.9), balls, corrected)
-print(f"1. e = {binary.value[0]:.3f}, rms {binary.rms:.4f} m/s, LZB {lzb_corrected.rms:.4f} m/s")
+print(
+    f"1. e = {binary.value[0]:.3f}, rms {binary.rms:.4f} m/s, LZB {lzb_corrected.rms:.4f} m/s"
+)
 noise = 0.005
 finer = ji.fit(start, balls, simulated_shots(0), starts=8)
-print("2. errors over those before:", (finer.standard_error / first.standard_error).round(2))
+print(
+    "2. errors over those before:",
+    (finer.standard_error / first.standard_error).round(2),
+)
 
 # %% [markdown]
 # *Next: [the same with your own file](02_your_own_csv.ipynb).*

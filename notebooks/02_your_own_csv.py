@@ -53,7 +53,9 @@ ji.plot.system(gliders, [0.5, 0.0, 0.0], "Shot a: the first glider strikes the o
 t = np.arange(160) / 200  # s
 since = t[:, None] - 0.4
 before, after = np.array([0.5, 0.0, 0.0]), np.array([-0.163, 0.130, 0.390])  # m/s
-places = np.where(since < 0, before, after) * since + 0.03 * since**2 / 2 + [0.0, 0.1, 0.2]
+places = (
+    np.where(since < 0, before, after) * since + 0.03 * since**2 / 2 + [0.0, 0.1, 0.2]
+)
 places += 5e-5 * np.random.default_rng(0).normal(size=places.shape)
 folder = Path(mkdtemp())
 head = [
@@ -66,7 +68,8 @@ rows = []
 for k, row in enumerate(1000 * places):  # mm
     hidden = [78 <= k < 86, False, False]
     cells = [
-        f"{0 if lost else x:.3f}\t{0 if lost else 5:.3f}\t0.000" for x, lost in zip(row, hidden)
+        f"{0 if lost else x:.3f}\t{0 if lost else 5:.3f}\t0.000"
+        for x, lost in zip(row, hidden)
     ]
     rows.append("\t".join(cells))
 recording = folder / "shot_a.tsv"
@@ -132,7 +135,9 @@ except ValueError as error:
 # %%
 momentum, energy = shots.momentum_ratio(gliders)[:, 0], shots.energy_ratio(gliders)
 for shot, p, t in zip(shots.shots, momentum, energy):
-    print(f"shot {shot}: momentum after / before {p:6.3f}, energy after / before {t:5.3f}")
+    print(
+        f"shot {shot}: momentum after / before {p:6.3f}, energy after / before {t:5.3f}"
+    )
 
 # %% [markdown]
 # Shot g has 30 % too much momentum. (In shot e the total momentum is 0, so its ratio says nothing.)
@@ -201,7 +206,10 @@ print(page.name, page.stat().st_size // 1000, "kB")
 
 # %%
 path.write_text(table.replace("64.5", "46.5").replace("61.9", "69.1"))
-print("1.", "\n   ".join(ji.fit(fit.law, gliders, ji.read_experiments(path), free).warnings))
+print(
+    "1.",
+    "\n   ".join(ji.fit(fit.law, gliders, ji.read_experiments(path), free).warnings),
+)
 each = ji.fit(fit.law, gliders, shots, {"restitution": [1, 2], "stiffness": [0, 1]})
 print("2.", each.verdict)
 

@@ -103,7 +103,9 @@ figure = Figure(figsize=(6, 3), layout="constrained")
 axes = figure.subplots()
 for i, colour in enumerate(("#0072B2", "#D55E00", "#009E73")):
     axes.semilogx(ratios, v_plus[:, i], color=colour, label=f"ball {i + 1}")
-axes.axhspan(*(partial.post[0, 1] + np.array([-2, 2]) * sigma), color="#D55E00", alpha=0.2, lw=0)
+axes.axhspan(
+    *(partial.post[0, 1] + np.array([-2, 2]) * sigma), color="#D55E00", alpha=0.2, lw=0
+)
 axes.set(xlabel="stiffness ratio $k_2/k_1$", ylabel="velocity after [m/s]")
 axes.legend(frameon=False)
 figure
@@ -114,7 +116,9 @@ limits = {"stiffness": (0.5, 100.0)}
 partial_fit = ji.fit(law(1.0, 5.0), balls, partial, ratio_only, bounds=limits)
 low, high = partial_fit.confidence_interval()[0]
 (union,) = ji.profile(partial_fit)
-print(f"standard error: {low:.1f} to {high:.1f};  profile: {union.words};  truth {truth}")
+print(
+    f"standard error: {low:.1f} to {high:.1f};  profile: {union.words};  truth {truth}"
+)
 assert any(low <= truth <= high for low, high in union.intervals)
 picture([union], [truth])
 
@@ -132,7 +136,9 @@ picture([union], [truth])
 # %%
 rng = np.random.default_rng(1)
 candidates = rng.uniform(-1, 1, (64, 3)).round(2)
-candidates[np.argsort(-candidates, axis=1)[:, 0] == 2] *= -1  # the last must not run away
+candidates[
+    np.argsort(-candidates, axis=1)[:, 0] == 2
+] *= -1  # the last must not run away
 pool = ji.Experiments(candidates, np.zeros_like(candidates), sigma)
 problem = ji.FitProblem.from_shots(fit.law, balls, pool, both)
 rows = np.asarray(problem.jacobian(fit.value)).reshape(64, 3, -1)  # of each candidate
@@ -149,7 +155,9 @@ for _ in range(2):
 # %%
 more = np.concatenate([one.pre, candidates[plan]])
 after = ji.fit(fit.law, balls, shots(law(0.95, 3.0), more, seed=1), both)
-print(f"shot 1 alone {fit.standard_error}, with the two planned ones {after.standard_error}")
+print(
+    f"shot 1 alone {fit.standard_error}, with the two planned ones {after.standard_error}"
+)
 print("values", after.value, "truth", [0.95, 3.0])
 assert after.standard_error[1] < 0.7 * fit.standard_error[1]
 ji.plot.system(balls, candidates[plan[0]], "The shot to do next")
@@ -169,7 +177,9 @@ print(f"run time {time.perf_counter() - began:.0f} s")
 needed = sigma * 0.05 / fit.standard_error[1]
 print(f"1. errors are proportional to sigma: {needed:.4f} m/s")
 ten = ji.fit(fit.law, balls, shots(law(0.95, 3.0), np.tile(strike, (10, 1))), both)
-print(f"2. {ten.standard_error[1]:.3f}: as the root of their number, if errors are independent")
+print(
+    f"2. {ten.standard_error[1]:.3f}: as the root of their number, if errors are independent"
+)
 
 # %% [markdown]
 # *Next: [a law that can describe any shot, and its limits](04_restitution_matrix.ipynb).*

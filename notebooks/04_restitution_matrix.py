@@ -74,7 +74,9 @@ print(ji.theory.audit_matrix(balls, [[1.0, 0.5], [0.0, 1.0]]))
 
 # %%
 truth, sigma = ji.LZB([0.9, 0.9], [1.0, 1.0]), 0.01
-kinds = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, -0.3]])
+kinds = np.array(
+    [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, -0.3]]
+)
 
 
 def shots(scene, pre, seed):
@@ -87,8 +89,14 @@ start = study.law
 one_side = ji.fit(start, balls, shots(balls, kinds[[0, 0, 0, 0]], 0), starts=1)
 two_sides = ji.fit(start, balls, shots(balls, kinds[[0, 0, 1, 1]], 1), starts=1)
 all_kinds = ji.fit(start, balls, shots(balls, kinds, 2), starts=1)
-for name, fit in (("one side", one_side), ("two sides", two_sides), ("all kinds", all_kinds)):
-    print(f"{name}: rank {fit.rank} of 4\n{np.asarray(fit.law.matrix)}\n{fit.warnings}\n")
+for name, fit in (
+    ("one side", one_side),
+    ("two sides", two_sides),
+    ("all kinds", all_kinds),
+):
+    print(
+        f"{name}: rank {fit.rank} of 4\n{np.asarray(fit.law.matrix)}\n{fit.warnings}\n"
+    )
 
 # %% [markdown]
 # Two kinds of shots determine $E$. A third kind contradicts them, because $E$ is linear in the
@@ -103,8 +111,14 @@ for name, fit in (("one side", one_side), ("two sides", two_sides), ("all kinds"
 figure = Figure(figsize=(6, 3), layout="constrained")
 axes = figure.subplots()
 masses = np.linspace(0.3, 3.0, 28)
-for law, colour, label in ((truth, "black", "LZB"), (two_sides.law, "#D55E00", "E of equal balls")):
-    v = [np.asarray(ji.impact(law, ji.chain([1.0, m, 1.0]), kinds[0]).velocity) for m in masses]
+for law, colour, label in (
+    (truth, "black", "LZB"),
+    (two_sides.law, "#D55E00", "E of equal balls"),
+):
+    v = [
+        np.asarray(ji.impact(law, ji.chain([1.0, m, 1.0]), kinds[0]).velocity)
+        for m in masses
+    ]
     axes.plot(masses, np.array(v)[:, 2], color=colour, label=label)
 axes.axvline(1.0, color="gray", lw=0.8)
 axes.set(xlabel="mass of the middle ball [kg]", ylabel="third ball after [m/s]")

@@ -37,7 +37,11 @@ import jimpact as ji
 
 began = time.perf_counter()
 cube = ji.Box(
-    [0.102] * 3, 0.37, [9.57e-4, 9.57e-4, 9.09e-4], centre=[0, 0, 0.0057], rounding=0.0036
+    [0.102] * 3,
+    0.37,
+    [9.57e-4, 9.57e-4, 9.09e-4],
+    centre=[0, 0, 0.0057],
+    rounding=0.0036,
 )
 figure = Figure(figsize=(6, 2.4), layout="constrained")
 poses = {
@@ -46,7 +50,9 @@ poses = {
     "four": [1, 0, 0, 0],
 }
 for axes, (name, e) in zip(figure.subplots(1, 3), poses.items()):
-    box, shadow = cube.outlines(np.asarray(cube.touching(np.array(e) / np.linalg.norm(e))), 0.0)
+    box, shadow = cube.outlines(
+        np.asarray(cube.touching(np.array(e) / np.linalg.norm(e))), 0.0
+    )
     axes.plot(*shadow.T, color="0.85")
     axes.plot(*box.T, color="#0072B2")
     axes.set(aspect="equal", title=name)
@@ -71,7 +77,9 @@ copies = np.triu(close, 1).any(axis=0)
 print(f"{len(shots.shots)} impacts, {copies.sum()} of them copies")
 shots = shots.only(~copies)
 one, two = (shots.only(shots.contacts == m) for m in (1, 2))
-print(f"one corner {len(one.shots)}, two corners {len(two.shots)}; errors {one.sigma[0]}")
+print(
+    f"one corner {len(one.shots)}, two corners {len(two.shots)}; errors {one.sigma[0]}"
+)
 print(f"energy left: {np.quantile(one.energy_ratio(), [0.1, 0.5, 0.9]).round(2)}")
 
 # %% [markdown]
@@ -84,10 +92,15 @@ print(f"energy left: {np.quantile(one.energy_ratio(), [0.1, 0.5, 0.9]).round(2)}
 # impulse; for one contact this is Newton's law).
 
 # %%
-groups = {m: np.array([int(s.split(":")[0]) % 5 for s in d.shots]) for m, d in ((1, one), (2, two))}
+groups = {
+    m: np.array([int(s.split(":")[0]) % 5 for s in d.shots])
+    for m, d in ((1, one), (2, two))
+}
 both = ("restitution", "friction")
 # errors before the impact are small compared with those of the laws; without them the fit is faster
-plain = ji.Experiments(one.pre, one.post, one.sigma, one.scenes, one.shots, units=one.units)
+plain = ji.Experiments(
+    one.pre, one.post, one.sigma, one.scenes, one.shots, units=one.units
+)
 few = [plain.only(np.flatnonzero(groups[1] == g)[:8]) for g in range(4)]
 fits = {
     type(law).__name__: ji.fit_many(law, None, few, both)
@@ -107,7 +120,8 @@ def predicted(laws, data, group):
     """Errors (laws, impacts); nan where a law was fitted to the group of the impact."""
     scenes = jax.tree.map(lambda *x: np.stack(x), *data.scenes)
     after = [
-        jax.vmap(ji.impact, in_axes=(None, 0, 0))(law, scenes, data.pre).velocity for law in laws
+        jax.vmap(ji.impact, in_axes=(None, 0, 0))(law, scenes, data.pre).velocity
+        for law in laws
     ]
     mass = np.stack([np.diag(m) if m.ndim == 1 else m for m in scenes.mass])
 
@@ -120,10 +134,14 @@ def predicted(laws, data, group):
 
 laws = {name: [f.law for f in found] for name, found in fits.items()}
 errors = {name: predicted(own, one, groups[1]) for name, own in laws.items()}
-apart = np.isin(one.shots, ji.data.cube_impacts(1, near=0.01).shots)  # the next corner far away
+apart = np.isin(
+    one.shots, ji.data.cube_impacts(1, near=0.01).shots
+)  # the next corner far away
 for name, off in errors.items():
     alone = np.nanmedian(off[:, apart])
-    print(f"{name}: median error {np.nanmedian(off):.1%}; the next corner 1 cm away: {alone:.1%}")
+    print(
+        f"{name}: median error {np.nanmedian(off):.1%}; the next corner 1 cm away: {alone:.1%}"
+    )
 
 # %%
 figure = Figure(figsize=(6, 3), layout="constrained")
@@ -131,7 +149,11 @@ axes = figure.subplots()
 for (name, off), colour in zip(errors.items(), ("#0072B2", "#D55E00")):
     off = np.sort(off[~np.isnan(off)])
     axes.plot(100 * off, np.linspace(0, 100, len(off)), color=colour, label=name)
-axes.set(xlim=(0, 20), xlabel="error of a prediction [%]", ylabel="share of the impacts below [%]")
+axes.set(
+    xlim=(0, 20),
+    xlabel="error of a prediction [%]",
+    ylabel="share of the impacts below [%]",
+)
 axes.legend(frameon=False)
 figure
 
@@ -161,7 +183,12 @@ lzb = fits["LZB"]
 print(*lzb[0].warnings, sep="\n")
 values = np.array([f.value for f in lzb])
 stated = np.array([f.standard_error for f in lzb])
-print("scatter of the four fits", values.std(axis=0, ddof=1), "stated", np.median(stated, axis=0))
+print(
+    "scatter of the four fits",
+    values.std(axis=0, ddof=1),
+    "stated",
+    np.median(stated, axis=0),
+)
 
 # %%
 assert np.nanmedian(errors["LZB"]) < np.nanmedian(errors["Moreau"]) < 0.07

@@ -42,7 +42,9 @@ v = jnp.array([1.0, 0.0, -1.0])
 law = ji.Compliant(ji.Hertz(1.06e10))  # N/m^1.5
 scale = ji.theory.gap_scale(balls, law, v)
 print(scale)
-ji.plot.system(ji.chain([small, large, small], gaps=[1e-5, 1e-5]), v, "Gaps not to scale")
+ji.plot.system(
+    ji.chain([small, large, small], gaps=[1e-5, 1e-5]), v, "Gaps not to scale"
+)
 
 # %% [markdown]
 # ## The crossover

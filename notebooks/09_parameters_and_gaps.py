@@ -94,7 +94,10 @@ for name, run in runs.items():
 
 # %%
 parameters, gaps_only, both = (run.std**2 for run in runs.values())
-print("sum of the two variances / variance of both:", ((parameters + gaps_only) / both).round(2))
+print(
+    "sum of the two variances / variance of both:",
+    ((parameters + gaps_only) / both).round(2),
+)
 print("share of the gaps:", (gaps_only / (parameters + gaps_only)).round(3))
 
 # %% [markdown]
@@ -110,7 +113,9 @@ for i, axes in enumerate(panels):
     for (name, run), colour in zip(runs.items(), ("#0072B2", "#D55E00", "black")):
         counts = run.counts[i, 1:-1].reshape(-1, 20).sum(axis=1)  # 50 wide bins of 1000
         edges = run.edges[i, ::20]
-        axes.stairs(counts / counts.sum() / np.diff(edges), edges, color=colour, label=name)
+        axes.stairs(
+            counts / counts.sum() / np.diff(edges), edges, color=colour, label=name
+        )
     axes.set(xlabel=f"ball {i + 1} after [m/s]", yticks=[])
 panels[0].legend(frameon=False)
 figure

@@ -32,7 +32,9 @@ from tempfile import mkdtemp
 
 import jax
 
-logging.getLogger("distributed").setLevel("ERROR")  # how Dask ends its workers is of no interest
+logging.getLogger("distributed").setLevel(
+    "ERROR"
+)  # how Dask ends its workers is of no interest
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np
@@ -40,7 +42,9 @@ import numpy as np
 import jimpact as ji
 
 balls, before = ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0]  # kg, m/s
-ji.plot.system(ji.chain([0.25, 1.0, 0.25], gaps=[1e-5, 1e-5]), before, "Gaps not to scale")
+ji.plot.system(
+    ji.chain([0.25, 1.0, 0.25], gaps=[1e-5, 1e-5]), before, "Gaps not to scale"
+)
 
 # %% [markdown]
 # ## The first quarter
@@ -54,7 +58,9 @@ law = ji.Binary(0.95, order="earliest")
 run = {"gaps": ji.Uniform(0.0, 20e-6), "chunk": 16384, "key": 0}
 folder = Path(mkdtemp()) / "run"
 start = time.perf_counter()
-first = ji.monte_carlo(law, balls, before, samples=500_000, folder=folder, executor="dask", **run)
+first = ji.monte_carlo(
+    law, balls, before, samples=500_000, folder=folder, executor="dask", **run
+)
 print(f"{first.samples} samples, {len(list(folder.glob('chunk*')))} files")
 print(f"{time.perf_counter() - start:.0f} s, most of it to start the workers")
 
@@ -65,7 +71,9 @@ print(f"{time.perf_counter() - start:.0f} s, most of it to start the workers")
 # law, scene, key or chunk would be refused with an error that names it.
 
 # %%
-whole = ji.monte_carlo(law, balls, before, samples=2_000_000, folder=folder, executor="dask", **run)
+whole = ji.monte_carlo(
+    law, balls, before, samples=2_000_000, folder=folder, executor="dask", **run
+)
 print(f"{whole.resumed} of {whole.samples} samples were read from the folder")
 print(whole)
 
@@ -101,7 +109,8 @@ for warning in caught:
 serial = ji.monte_carlo(law, balls, before, samples=2_000_000, **run)
 for name in ("mean", "covariance", "counts"):
     same = all(
-        np.array_equal(getattr(serial, name), getattr(other, name)) for other in (whole, again)
+        np.array_equal(getattr(serial, name), getattr(other, name))
+        for other in (whole, again)
     )
     print(f"{name:10s} equal, bit by bit: {same}")
     assert same

@@ -35,7 +35,9 @@ import numpy as np
 import jimpact as ji
 
 block = ji.Block(width=1.0, height=2.0)
-ji.plot.system(block, block.touching(0.1), "Rocking about A, the left corner; B comes down")
+ji.plot.system(
+    block, block.touching(0.1), "Rocking about A, the left corner; B comes down"
+)
 
 # %% [markdown]
 # ## Dispersion is a V over the kinetic angle
@@ -53,7 +55,9 @@ print(result)
 
 # %%
 # |d| = |y_A'+ / y_B'-|
-ji.plot.rocking_dispersion(result, "Velocity of A after over velocity of B before, by LZB")
+ji.plot.rocking_dispersion(
+    result, "Velocity of A after over velocity of B before, by LZB"
+)
 
 # %% [markdown]
 # The curve is a V with two deviations. At the kink on the right (mu = 0.3, 112 degrees) B begins to
@@ -75,11 +79,15 @@ tips = np.sqrt((2 - 4 * c) / (1 + c))  # as aspects
 off = np.arange(-7, 8) / 7000
 near = ji.theory.rocking_dispersion((tips[:, None] * (1 + off)).ravel(), mu, e)
 size = np.abs(np.asarray(near.dispersion)).reshape(4, 15, 4, 6)
-print("mu   critical angle   a_c      where |d| is least, in (a - a_c) / a_c, by e; |d| there")
+print(
+    "mu   critical angle   a_c      where |d| is least, in (a - a_c) / a_c, by e; |d| there"
+)
 for j, m in enumerate(mu):
     least = off[size[j, :, j].argmin(axis=0)]
     angle = np.degrees(np.arccos(c[j]))
-    print(f"{m:3.1f} {angle:9.3f} deg {tips[j]:10.5f}   {least}   {size[j, :, j].min():.0e}")
+    print(
+        f"{m:3.1f} {angle:9.3f} deg {tips[j]:10.5f}   {least}   {size[j, :, j].min():.0e}"
+    )
 
 # %% [markdown]
 # The tip is at the same place for all six restitutions. (`ji.theory.search_critical_angle` finds it
@@ -113,7 +121,9 @@ print("   a   Housner   e_theta by LZB, mu = 0, 0.1, 0.8")
 for i in range(0, 480, 80):
     a = float(plastic.aspect[i])
     ratios = np.asarray(plastic.angular_ratio[i, :, 0])
-    print(f"{a:5.2f} {float(ji.theory.housner_restitution(a)):8.4f}     {ratios.round(4)}")
+    print(
+        f"{a:5.2f} {float(ji.theory.housner_restitution(a)):8.4f}     {ratios.round(4)}"
+    )
 
 before = [1.5, -0.5, -1.0]  # a = 3: rotating about A, corner B comes down with 1
 block = ji.Block(1.0, 3.0, corners="base").scene()
@@ -136,7 +146,9 @@ print(
 
 # %%
 for row in ji.theory.rocking_ratios():
-    print(f"a = {row.aspect:g}, {row.material}: e_theta = {row.restitution:.3f}, ", end="")
+    print(
+        f"a = {row.aspect:g}, {row.material}: e_theta = {row.restitution:.3f}, ", end=""
+    )
     print(f"{row.measured_over_housner:g} of Housner's value")
 
 # %% [markdown]
@@ -163,10 +175,16 @@ ratios = -events.velocity_after[:4, 2] / -events.velocity_before[:4, 2]
 print("e = 0, angular velocity kept by the first four hits:", np.asarray(ratios))
 print("Housner's value:", float(ji.theory.housner_restitution(3.0)))
 top = {e_n: np.nanmax(-np.asarray(m.q[:, 2])) for e_n, m in motions.items()}
-print("largest angle on the other side, e = 0 and 0.1:", np.degrees(list(top.values())), "degrees")
+print(
+    "largest angle on the other side, e = 0 and 0.1:",
+    np.degrees(list(top.values())),
+    "degrees",
+)
 
 # %%
-ji.plot.phase_portrait(motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking", system=system)
+ji.plot.phase_portrait(
+    motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking", system=system
+)
 
 # %% [markdown]
 # *Next: [whole motions](12_whole_motions.ipynb).*

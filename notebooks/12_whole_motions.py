@@ -62,7 +62,9 @@ ji.plot.motion(motion, "Newton's cradle, 50 swings", names, cradle)
 energy = np.asarray(motion.kinetic_energy + motion.potential_energy)
 work = np.asarray(motion.contact_work).sum(axis=(1, 2))
 print(f"energy at the end {energy[-1] / energy[0]:.3f} of the start")
-print(f"work of the contacts {work[-1]:.6f} J, change of energy {energy[-1] - energy[0]:.6f} J")
+print(
+    f"work of the contacts {work[-1]:.6f} J, change of energy {energy[-1] - energy[0]:.6f} J"
+)
 print("largest residual", float(np.abs(motion.ledger_residual).max()), "J")
 
 # %% [markdown]
@@ -74,7 +76,12 @@ print("largest residual", float(np.abs(motion.ledger_residual).max()), "J")
 # %%
 for law in (ji.LZB(0.95, exponent=1.5), ji.Newton(0.95)):
     swing = ji.simulate(cradle, law, [-0.3, 0, 0], [0.0, 0, 0], period / 2, samples=101)
-    print(type(law).__name__, "largest angles", np.asarray(swing.q).max(axis=0).round(3), "rad")
+    print(
+        type(law).__name__,
+        "largest angles",
+        np.asarray(swing.q).max(axis=0).round(3),
+        "rad",
+    )
 
 # %% [markdown]
 # The bundled studies show other motions: `jimpact simulate shaken_dimer.toml --gif dimer.gif`

@@ -69,7 +69,9 @@ ji.plot.phase_portrait(motion, title="Bouncing ball, e = 0.8", system=ball)
 # %%
 start = ([1.0], [0.0], 1.5)
 exact_heights = np.asarray(ji.simulate(ball, ji.Newton(0.8), *start, samples=76).q)
-measured = exact_heights + 2e-3 * np.random.default_rng(0).normal(size=exact_heights.shape)
+measured = exact_heights + 2e-3 * np.random.default_rng(0).normal(
+    size=exact_heights.shape
+)
 fit = ji.fit_motion(ball, ji.Newton(0.75), measured, *start, sigma=2e-3)
 print(fit)
 

@@ -56,7 +56,9 @@ def rock(tilt, acceleration):
     base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
     height = 0.1 * jnp.sin(tilt) + 0.3 * jnp.cos(tilt)
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
-    block = ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base, friction=5.0)
+    block = ji.System(
+        ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base, friction=5.0
+    )
     start = jnp.stack([amplitude, height, tilt])
     return ji.simulate(block, law, start, jnp.zeros(3), 3.0)
 
@@ -65,14 +67,19 @@ levels = np.array([0.0, 0.3, 0.4, 0.6, 0.8, 1.0, 1.4])
 motions = rock(np.where(levels == 0, 0.15, 0.0), levels)
 free = jax.tree.map(lambda x: x[0], motions)
 print(free)
-ji.plot.phase_portrait(free, 2, "Free rocking, angle", ["x [m]", "y [m]", "angle [rad]"])
+ji.plot.phase_portrait(
+    free, 2, "Free rocking, angle", ["x [m]", "y [m]", "angle [rad]"]
+)
 
 # %%
 for i, level in enumerate(levels[1:], 1):
     lane = jax.tree.map(lambda x, i=i: x[i], motions)
     most = np.degrees(np.nanmax(np.abs(lane.q[:, 2])))
     overturns = lane.to_dict()["status"] == "out_of_range"
-    print(f"{level:.1f} g: " + ("overturns" if overturns else f"at most {most:.2f} degrees"))
+    print(
+        f"{level:.1f} g: "
+        + ("overturns" if overturns else f"at most {most:.2f} degrees")
+    )
 
 # %% [markdown]
 # Next: [robots from MuJoCo](15_robots_from_mujoco.ipynb).

@@ -55,7 +55,10 @@ data = mujoco.MjData(model)
 def draw(axes, color):
     """The left half of the biped from the side: joints, and the outline of the foot and the torso."""
     mujoco.mj_kinematics(model, data)
-    joints = [data.body(name).xpos for name in ("torso", "left thigh", "left shank", "left foot")]
+    joints = [
+        data.body(name).xpos
+        for name in ("torso", "left thigh", "left shank", "left foot")
+    ]
     axes.plot(*np.array(joints)[:, [0, 2]].T, "o-", color=color)
     for body in ("torso", "left foot"):
         geom = model.body(body).geomadr[0]
@@ -70,7 +73,11 @@ figure, axes = plt.subplots(figsize=(3.2, 4.2))
 draw(axes, "C0")
 axes.axhline(0, color="0.5")
 axes.set(
-    aspect="equal", xlim=(-0.5, 0.5), xlabel="x [m]", ylabel="z [m]", title="A biped, from the side"
+    aspect="equal",
+    xlim=(-0.5, 0.5),
+    xlabel="x [m]",
+    ylabel="z [m]",
+    title="A biped, from the side",
 )
 # %% [markdown]
 # ## From the model to a scene
@@ -100,14 +107,23 @@ laws = {
     "LZB": ji.LZB(0.2, 1.0, friction=friction),
     "LZB, no friction": ji.LZB(0.2, 1.0),
 }
-joints = ["torso x [m/s]", "torso z [m/s]", "torso pitch [rad/s]", "hip", "knee", "ankle"]
+joints = [
+    "torso x [m/s]",
+    "torso z [m/s]",
+    "torso pitch [rad/s]",
+    "hip",
+    "knee",
+    "ankle",
+]
 shown = [0, 2, 4, 6, 7, 8]
 figure, axes = plt.subplots(figsize=(6.4, 3.2))
 for k, (name, law) in enumerate(laws.items()):
     out = ji.impact(law, biped.scene, biped.velocity)
     change = float(out.energy_change / ji.kinetic_energy(biped.scene, biped.velocity))
     print(f"{name:17} {ji.STATUS[int(out.status)].name:20} energy {change:+.1%}")
-    axes.bar(np.arange(6) + 0.27 * (k - 1), np.asarray(out.velocity)[shown], 0.25, label=name)
+    axes.bar(
+        np.arange(6) + 0.27 * (k - 1), np.asarray(out.velocity)[shown], 0.25, label=name
+    )
 axes.set_xticks(range(6), joints, rotation=20)
 axes.set_ylabel("velocity after the impact")
 axes.legend()
@@ -129,7 +145,9 @@ def landing(restitution, mu):
 slopes = jax.jacfwd(landing, argnums=(0, 1))(jnp.full(2, 0.2), jnp.full(2, 0.3))
 for name, slope in zip(("restitution", "friction"), slopes, strict=True):
     print(f"by {name} of the left and the right foot")
-    for joint, row in zip([*joints[:2], "torso roll [rad/s]"], slope[jnp.array([0, 2, 3])]):
+    for joint, row in zip(
+        [*joints[:2], "torso roll [rad/s]"], slope[jnp.array([0, 2, 3])]
+    ):
         print(f"  {joint:20} {row[0]:+.4f} {row[1]:+.4f}")
 
 # %% [markdown]
@@ -152,7 +170,9 @@ def fall(with_law):
         mujoco.mj_step(model, data)
         if with_law and data.ncon == 8:
             biped = ji.from_mujoco(model, data)
-            if float(ji.gap_velocity(biped.scene, biped.velocity).min()) < -0.05:  # [m/s]
+            if (
+                float(ji.gap_velocity(biped.scene, biped.velocity).min()) < -0.05
+            ):  # [m/s]
                 out = ji.raise_on_failure(ji.impact(law, biped.scene, biped.velocity))
                 data.qvel[:] = out.velocity
         heights.append((data.time, data.geom("left foot").xpos[2] - 0.02))

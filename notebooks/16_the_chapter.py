@@ -111,7 +111,9 @@ chapter_figures.draw("6.8b")
 # %%
 for m in range(1, 7):
     before = np.arange(10) < m
-    out = ji.impact(ji.LZB(1.0, np.ones(9)), ji.chain(np.ones(10)), before.astype(float))
+    out = ji.impact(
+        ji.LZB(1.0, np.ones(9)), ji.chain(np.ones(10)), before.astype(float)
+    )
     forward = np.asarray(out.velocity)[np.asarray(out.velocity) > 0]
     print(
         f"{m} hit {10 - m}: {len(forward)} move forward, with {sum(forward**2) / m:.1%} of the energy"

@@ -44,7 +44,12 @@ axes = figure.subplots()
 for pose in poses[0, ::4]:
     axes.plot(*block.outlines(pose, 0.0)[0].T, color="#0072B2", linewidth=0.7)
 axes.axhline(0, color="0.4")
-axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"Drop {drops[0]}, every 16 ms")
+axes.set(
+    aspect="equal",
+    xlabel="x [m]",
+    ylabel="y [m]",
+    title=f"Drop {drops[0]}, every 16 ms",
+)
 figure
 
 # %% [markdown]
@@ -87,11 +92,18 @@ law = ji.Moreau(0.5, friction=0.2)
 both = ("restitution", "friction")
 known = [int(label.split(":")[0]) not in drops for label in corner.shots]
 corner, unseen = corner.only(known), corner.only(np.invert(known))
-sets = {"ellipse": ellipse.only(slice(0, 1300, 10)), "square": corner.only(slice(0, 130))}
+sets = {
+    "ellipse": ellipse.only(slice(0, 1300, 10)),
+    "square": corner.only(slice(0, 130)),
+}
 fits = {}
 for name, shots in sets.items():
-    plain = ji.Experiments(shots.pre, shots.post, scenes=shots.scenes, units=shots.units)
-    fits[name] = ji.fit(law, None, plain, both, starts=1, search=ji.Search(loss="huber"))
+    plain = ji.Experiments(
+        shots.pre, shots.post, scenes=shots.scenes, units=shots.units
+    )
+    fits[name] = ji.fit(
+        law, None, plain, both, starts=1, search=ji.Search(loss="huber")
+    )
     print(f"{name}: {fits[name].value.round(3)}, rms {fits[name].rms:.2f} m/s")
 print(str(fits["ellipse"]).split("\n\n")[0])
 print(*fits["ellipse"].warnings, sep="\n")
@@ -109,7 +121,9 @@ root = np.sqrt(np.asarray(scenes.mass[0]))
 error = np.linalg.norm(root * (after - unseen.post), axis=1) / np.linalg.norm(
     root * unseen.pre, axis=1
 )
-print(f"{len(error)} impacts, |v+ predicted - v+| / |v-|: median {np.median(error):.1%}")
+print(
+    f"{len(error)} impacts, |v+ predicted - v+| / |v-|: median {np.median(error):.1%}"
+)
 
 # %% [markdown]
 # That is much more than an impulse at the corner leaves: restitution scatters from impact to impact,
@@ -118,7 +132,10 @@ print(f"{len(error)} impacts, |v+ predicted - v+| / |v-|: median {np.median(erro
 # %%
 gap = np.einsum("ki,ki->k", np.asarray(scenes.normals)[:, :, 0], unseen.pre)
 gap_after = np.einsum("ki,ki->k", np.asarray(scenes.normals)[:, :, 0], unseen.post)
-print("e of each impact, quartiles:", np.quantile(-gap_after / gap, [0.25, 0.5, 0.75]).round(2))
+print(
+    "e of each impact, quartiles:",
+    np.quantile(-gap_after / gap, [0.25, 0.5, 0.75]).round(2),
+)
 
 # %% [markdown]
 # ## Predict whole drops
@@ -151,7 +168,9 @@ def state(flight):
     """q and v at the first of nine poses of a flight."""
     t = np.arange(FRAMES) * 0.004
     straight = flight[:FRAMES] + np.array([0, 0.5 * 9.81, 0]) * t[:, None] ** 2
-    return np.linalg.lstsq(np.stack([np.ones(FRAMES), t], axis=1), straight, rcond=None)[0]
+    return np.linalg.lstsq(
+        np.stack([np.ones(FRAMES), t], axis=1), straight, rcond=None
+    )[0]
 
 
 @jax.jit
@@ -160,7 +179,15 @@ def simulated(law, q, v):
 
     def one(q, v):
         return ji.simulate(
-            system, law, q, v, 0.796, samples=REST, method="time_stepping", step=2e-4, max_events=60
+            system,
+            law,
+            q,
+            v,
+            0.796,
+            samples=REST,
+            method="time_stepping",
+            step=2e-4,
+            max_events=60,
         )
 
     return jax.vmap(one)(q, v).q
@@ -177,9 +204,13 @@ for name, of_first in (("first flight", True), ("after an impact", False)):
     at = np.array([state(poses[k, s:]) for k, s in begin])
     found = np.asarray(simulated(fits["square"].law, at[:, 0], at[:, 1]))
     predicted[name] = begin, found
-    right = np.mean([sides(poses[k, -1]) == sides(f[-1]) for (k, _), f in zip(begin, found)])
+    right = np.mean(
+        [sides(poses[k, -1]) == sides(f[-1]) for (k, _), f in zip(begin, found)]
+    )
     off = [abs(poses[k, -1, 0] - f[-1, 0]) for (k, _), f in zip(begin, found)]
-    print(f"{name}: {len(begin)} drops, {right:.0%} rest on the predicted side, ", end="")
+    print(
+        f"{name}: {len(begin)} drops, {right:.0%} rest on the predicted side, ", end=""
+    )
     print(f"{1e3 * np.median(off):.0f} mm off (median)")
 
 
@@ -192,7 +223,9 @@ for name, of_first in (("first flight", True), ("after an impact", False)):
 def hits(q, least=5):
     """Frames in which a flight of at least `least` frames ends."""
     free = np.asarray(jax.vmap(block.gap_function)(q)).min(axis=1) > 2e-3
-    return [i for i in range(least, len(q)) if not free[i] and free[i - least : i].all()]
+    return [
+        i for i in range(least, len(q)) if not free[i] and free[i - least : i].all()
+    ]
 
 
 for name, (begin, found) in predicted.items():
@@ -204,7 +237,9 @@ for name, (begin, found) in predicted.items():
                 i, j = measured[which], simulation[which]
                 misses.append([4 * abs(i - j), 1e3 * abs(poses[k, s + i, 0] - f[j, 0])])
         ms, mm = np.median(misses, axis=0)
-        print(f"{name}, hit {which + 1}: {ms:.0f} ms, {mm:.1f} mm off (median of {len(misses)})")
+        print(
+            f"{name}, hit {which + 1}: {ms:.0f} ms, {mm:.1f} mm off (median of {len(misses)})"
+        )
 
 # %%
 begin, found = predicted["after an impact"]
@@ -218,7 +253,9 @@ for axes, (k, s), f in zip(figure.subplots(3, 2).flat, begin[::16], found[::16])
     axes.axhline(0, color="0.4", linewidth=0.8)
     axes.set_title(f"drop {drops[k]}", fontsize=9)
     axes.set_aspect("equal", adjustable="datalim")
-figure.suptitle("Centre of the square: measured (blue), predicted (orange)", fontsize=10)
+figure.suptitle(
+    "Centre of the square: measured (blue), predicted (orange)", fontsize=10
+)
 figure
 
 # %% [markdown]

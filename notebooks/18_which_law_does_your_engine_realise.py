@@ -65,7 +65,9 @@ def beside(scene, measured, e=1.0, title=""):
     table = ji.compare(scene, before, laws)
     for name, entry in table.entries.items():
         off = np.linalg.norm(np.asarray(entry.outcome.velocity) - measured)
-        print(f"{name:13} {np.round(entry.outcome.velocity, 3) + 0.0}  off by {off:.3f}")
+        print(
+            f"{name:13} {np.round(entry.outcome.velocity, 3) + 0.0}  off by {off:.3f}"
+        )
     return ji.plot.comparison(table, measured, title=title)
 
 
@@ -79,7 +81,9 @@ beside(three, yours["S1"], title=f"Three balls, e = 1: laws, and {ENGINE} (dashe
 # %%
 for law in ("Moreau", "Binary", "LZB, Hertz", "LZB, linear springs", "plastic"):
     rows = ji.data.engine_impacts(scene="S1").rows
-    names = dict.fromkeys(r.engine for r in rows if r.nearest_law == law and r.distance < 0.03)
+    names = dict.fromkeys(
+        r.engine for r in rows if r.nearest_law == law and r.distance < 0.03
+    )
     print(f"{law:20} {', '.join(names)}")
 
 # %% [markdown]
@@ -94,7 +98,9 @@ for law in ("Moreau", "Binary", "LZB, Hertz", "LZB, linear springs", "plastic"):
 # %%
 es = np.linspace(0, 1, 101)
 for name, make in LAWS.items():
-    impact = jax.vmap(lambda e, make=make: ji.impact(make(e), three, [1.0, 0.0, 0.0]).velocity)
+    impact = jax.vmap(
+        lambda e, make=make: ji.impact(make(e), three, [1.0, 0.0, 0.0]).velocity
+    )
     after = jax.jit(impact)(es)
     off = np.linalg.norm(after - np.array(yours["S3"]), axis=1)
     print(f"{name:13} e = {es[off.argmin()]:.2f}, off by {off.min():.4f}")
@@ -121,7 +127,9 @@ beside(five, yours["S2"], title=f"Five balls, e = 1: laws, and {ENGINE} (dashed)
 
 # %%
 wall = ji.chain([1.0, 1.0], wall=True)
-beside(wall, yours["S4"], title=f"Two balls and a wall, e = 1: laws, and {ENGINE} (dashed)")
+beside(
+    wall, yours["S4"], title=f"Two balls and a wall, e = 1: laws, and {ENGINE} (dashed)"
+)
 
 # %% [markdown]
 # ## Beside steel balls
@@ -132,7 +140,9 @@ beside(wall, yours["S4"], title=f"Two balls and a wall, e = 1: laws, and {ENGINE
 path = files("jimpact") / "data" / "three_balls.csv"
 measured = np.asarray(ji.read_experiments(path).post[0])
 rows = ji.data.engine_impacts(scene="S1").rows
-ranked = sorted((float(np.linalg.norm(measured - r.velocity)), r.engine, r.setting) for r in rows)
+ranked = sorted(
+    (float(np.linalg.norm(measured - r.velocity)), r.engine, r.setting) for r in rows
+)
 print("measured", measured)
 for off, engine, setting in [*ranked[:6], *ranked[-3:]]:
     print(f"off by {off:.2f}: {engine}, {setting}")

@@ -21,7 +21,12 @@ import jimpact as ji
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 GREY = "#777777"
-ON_LINES = {"fc": "white", "ec": "none", "pad": 1, "alpha": 0.8}  # behind a text on lines
+ON_LINES = {
+    "fc": "white",
+    "ec": "none",
+    "pad": 1,
+    "alpha": 0.8,
+}  # behind a text on lines
 SMALL = 8.5  # font size [points]
 
 
@@ -87,16 +92,22 @@ def springs() -> Figure:
     figure = new_figure(2.6)
     axes = figure.subplots()
     for i in range(3):
-        axes.add_patch(Circle((4 * i, 0), 0.8, fc=COLOURS[i], alpha=0.35, ec=COLOURS[i]))
+        axes.add_patch(
+            Circle((4 * i, 0), 0.8, fc=COLOURS[i], alpha=0.35, ec=COLOURS[i])
+        )
         axes.text(4 * i, 0, f"$m_{i + 1}$", ha="center", va="center")
         _arrow(axes, (4 * i - 0.6, 1.3), (4 * i + 0.6, 1.3), "")
         axes.text(4 * i, 1.6, f"$x_{i + 1}$", ha="center", va="bottom")
     for i in range(2):
         start, end = 4 * i + 0.8, 4 * i + 3.0
-        x = np.concatenate([[start], np.linspace(start + 0.3, end - 0.3, 2 * _COILS), [end]])
+        x = np.concatenate(
+            [[start], np.linspace(start + 0.3, end - 0.3, 2 * _COILS), [end]]
+        )
         y = np.concatenate([[0], 0.3 * (-1.0) ** np.arange(2 * _COILS), [0]])
         axes.plot(x, y, color="black", lw=1.2)
-        axes.plot([end, end], [-0.5, 0.5], color="black", lw=3)  # a plate, which the ball may leave
+        axes.plot(
+            [end, end], [-0.5, 0.5], color="black", lw=3
+        )  # a plate, which the ball may leave
         axes.text((start + end) / 2, -1.0, f"$k_{i + 1}$", ha="center", va="center")
     _only(axes, (-1.5, 9.5), (-1.4, 2.3))
     return figure
@@ -109,10 +120,19 @@ def block() -> Figure:
     body = ji.Block(width=1.0, height=1.6)
     q = np.asarray(body.touching(_TURNED))
     _drawn(axes, body, q)
-    along, up = np.array([np.cos(q[2]), np.sin(q[2])]), np.array([-np.sin(q[2]), np.cos(q[2])])
+    along, up = (
+        np.array([np.cos(q[2]), np.sin(q[2])]),
+        np.array([-np.sin(q[2]), np.cos(q[2])]),
+    )
     corners = [q[:2] - 0.8 * up + s * 0.5 * along for s in (-1, 1)]
     for name, at, side in zip("AB", corners, (-2, 1), strict=True):
-        write(axes, at + np.array([0.1 * side, 0.08]), name, fontweight="bold", fontsize="medium")
+        write(
+            axes,
+            at + np.array([0.1 * side, 0.08]),
+            name,
+            fontweight="bold",
+            fontsize="medium",
+        )
     axes.plot(*q[:2], "o", color="black", ms=4)
     axes.text(q[0] + 0.06, q[1] + 0.04, "G")
     top = q[:2] + 0.8 * up
@@ -121,7 +141,12 @@ def block() -> Figure:
     _distance(axes, left - 0.8 * up, left + 0.8 * up, "l")
     axes.set_ylim(-0.1, 2.0)
     foot, part = corners[0], np.linspace(0, q[2], 30)
-    axes.plot(foot[0] + 0.75 * np.cos(part), foot[1] + 0.75 * np.sin(part), color="black", lw=1)
+    axes.plot(
+        foot[0] + 0.75 * np.cos(part),
+        foot[1] + 0.75 * np.sin(part),
+        color="black",
+        lw=1,
+    )
     axes.text(foot[0] + 0.82, foot[1] + 0.05, r"$\theta$")
     return figure
 
@@ -133,11 +158,16 @@ def dimer() -> Figure:
     body = ji.Dimer(radius=0.25, length=1.0)
     q = np.asarray(body.touching(0.25)) + np.array([0, 0.15, 0])
     _drawn(axes, body, q)
-    along, up = np.array([np.cos(q[2]), np.sin(q[2])]), np.array([-np.sin(q[2]), np.cos(q[2])])
+    along, up = (
+        np.array([np.cos(q[2]), np.sin(q[2])]),
+        np.array([-np.sin(q[2]), np.cos(q[2])]),
+    )
     _distance(axes, q[:2] - 0.5 * along + 0.1 * up, q[:2] + 0.5 * along + 0.1 * up, "L")
     centre = q[:2] + 0.75 * along
     _arrow(axes, centre, centre + 0.25 * up, "")
-    write(axes, centre + 0.08 * along + 0.12 * up, "R", style="italic", fontsize="medium")
+    write(
+        axes, centre + 0.08 * along + 0.12 * up, "R", style="italic", fontsize="medium"
+    )
     for name, at in (("2", q[:2] - 0.75 * along), ("1", centre)):
         axes.text(at[0], 0.03, f"$f_{name}$", ha="center")
     axes.set_ylim(-0.15, 1.15)
@@ -155,14 +185,18 @@ def _drawn(axes: Axes, body: ji.Body, q: Any) -> None:
 
 def _distance(axes: Axes, start: Any, end: Any, name: str) -> None:
     """A length between two arrows, named at its middle."""
-    axes.annotate("", end, start, arrowprops={"arrowstyle": "<|-|>", "color": "black", "lw": 1})
+    axes.annotate(
+        "", end, start, arrowprops={"arrowstyle": "<|-|>", "color": "black", "lw": 1}
+    )
     middle = (np.asarray(start) + np.asarray(end)) / 2
     write(axes, middle, name, fontsize="medium", style="italic", bbox=ON_LINES)
 
 
 def _arrow(axes: Axes, start: Any, end: Any, name: str) -> None:
     """An arrow with a name at its tail."""
-    axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.2})
+    axes.annotate(
+        "", end, start, arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.2}
+    )
     if name:
         write(axes, start, f"{name}  ", ha="right", fontsize="medium", style="italic")
 
@@ -202,11 +236,15 @@ def wall_histories(drops: dict[float, tuple[int, ...]]) -> dict[tuple[float, int
 
     def one(gaps: jax.Array, velocity: jax.Array) -> Any:
         """One column."""
-        return ji.history(law, ji.chain([BEAD] * most, wall=True, gaps=gaps), velocity, _SAMPLES)
+        return ji.history(
+            law, ji.chain([BEAD] * most, wall=True, gaps=gaps), velocity, _SAMPLES
+        )
 
     gaps = jnp.asarray(np.where(absent, _AWAY, 0.0))
     rows = jax.jit(jax.vmap(one))(gaps, before)
-    return {case: jax.tree.map(lambda x, i=i: x[i], rows) for i, case in enumerate(cases)}
+    return {
+        case: jax.tree.map(lambda x, i=i: x[i], rows) for i, case in enumerate(cases)
+    }
 
 
 def wall_forces() -> Figure:
@@ -220,7 +258,9 @@ def wall_forces() -> Figure:
             at, force = np.asarray(h.time) * 1e6, np.asarray(h.force[:, -1])
             axes.plot(at, force, color=COLOURS[i], label=f"N = {n}")
         axes.set_ylabel("force at the wall [N]")
-        axes.set_title(f"drop height {1e3 * height:g} mm", loc="left", fontsize="medium")
+        axes.set_title(
+            f"drop height {1e3 * height:g} mm", loc="left", fontsize="medium"
+        )
         axes.set_ylim(bottom=0)
         legend_within(axes)
     panels[-1].set_xlabel("impact time [us]")
@@ -236,7 +276,10 @@ def loop() -> Figure:
     )
 
 
-_A, _B = np.array([0.0, 0.0, 1.0]), np.array([-1 / 3, 2 / 3, 2 / 3])  # ends of the arc AB
+_A, _B = (
+    np.array([0.0, 0.0, 1.0]),
+    np.array([-1 / 3, 2 / 3, 2 / 3]),
+)  # ends of the arc AB
 _GRID = 31  # values of e1 and of e2 whose outcomes fill a region; ten times more looks the same
 _RATIOS = np.geomspace(1e-2, 1e2, 41)  # k2/k1 of the curves of LZB in figure 5.5
 _RATIO = 0.8  # impulse correlation ratio of figure 6.3b: from 0.5, where B is, to 1, where A is
@@ -255,7 +298,9 @@ def reached() -> Figure:
     )
     _region(axes, binary.reshape(_GRID, _GRID, 2), _PALE, "II: binary collisions")
     around = poisson[ConvexHull(poisson).vertices]
-    axes.fill(*around.T, fc="none", ec=COLOURS[2], ls="--", lw=1.5, label="Poisson, e <= 1")
+    axes.fill(
+        *around.T, fc="none", ec=COLOURS[2], ls="--", lw=1.5, label="Poisson, e <= 1"
+    )
     for kept in (0.4, 0.6, 0.8, 1.0):
         axes.plot(*_energy_arc(kept).T, color="black", lw=2 if kept == 1 else 0.8)
         write(axes, _energy_arc(kept)[35], f"K_ER = {kept:g}", bbox=ON_LINES)
@@ -263,7 +308,9 @@ def reached() -> Figure:
     for colour, each in zip((1, 3, 5), (1.0, 0.9, 0.5), strict=True):
         gaps = _gaps(_outcomes(ji.LZB, np.full(stiffness.shape, each), stiffness))
         axes.plot(*gaps.T, color=COLOURS[colour], lw=2.4, label=f"LZB, e = {each:g}")
-    axes.plot([0, 1], [0, 0], color=COLOURS[4], lw=4, label="Moreau", clip_on=False, zorder=3)
+    axes.plot(
+        [0, 1], [0, 0], color=COLOURS[4], lw=4, label="Moreau", clip_on=False, zorder=3
+    )
     for name, end in (("A", (0, 1.05)), ("B", (1.05, 0.03))):
         write(axes, end, name, fontsize="x-large", fontweight="bold")
     axes.set_xlim(0, 1.3)
@@ -320,7 +367,9 @@ def two_balls() -> Figure:
     axes.plot(x, 1 - x, color=COLOURS[0], label="momentum")
     side = np.array([-1.3, 1.3])
     axes.plot(side, side, color=GREY, lw=1, ls="--", label="$V_1^+ = V_2^+$")
-    axes.fill_between(side, side, 1.3, color=COLOURS[4], alpha=0.2, lw=0, label="admissible")
+    axes.fill_between(
+        side, side, 1.3, color=COLOURS[4], alpha=0.2, lw=0, label="admissible"
+    )
     axes.plot(1, 0, "o", color="black", mfc="none", ms=9, ls="none", label="before")
     axes.plot(0, 1, "o", color=COLOURS[1], ms=9, ls="none", label="after")
     axes.set_aspect("equal")
@@ -383,12 +432,15 @@ def _ball_of_energy(axes: Any) -> None:
     disc = centre + np.sqrt(2 / 3) * (np.cos(circle) * right + np.sin(circle) * up)
     one = np.ones(3) / np.sqrt(3)
     sides = [
-        np.array([[0, 0, 0], out, out + one, one]) for out in (1.2 * right, 1.2 * (_B - 1 / 3))
+        np.array([[0, 0, 0], out, out + one, one])
+        for out in (1.2 * right, 1.2 * (_B - 1 / 3))
     ]
     names = "P1: momentum", "P2: contact 1 closed", "P3: contact 2 closed"
     for i, (shape, name) in enumerate(zip((disc, *sides), names, strict=True)):
         colour = COLOURS[(4, 5, 2)[i]]
-        axes.add_collection3d(Poly3DCollection([shape], fc=colour, alpha=0.3, lw=0, label=name))
+        axes.add_collection3d(
+            Poly3DCollection([shape], fc=colour, alpha=0.3, lw=0, label=name)
+        )
 
 
 def block_domain() -> Figure:
@@ -423,7 +475,9 @@ def critical_angle() -> Figure:
     left, right = figure.subplots(1, 2)
     mus, es = [0.0, 0.1, 0.3, 0.8], [0.5, 1.0]
     cosine = np.cos(ji.theory.critical_kinetic_angle(mus))
-    tips = np.sqrt((2 - 4 * cosine) / (1 + cosine))  # the aspects that have these kinetic angles
+    tips = np.sqrt(
+        (2 - 4 * cosine) / (1 + cosine)
+    )  # the aspects that have these kinetic angles
     aspects = np.sort(np.concatenate([np.linspace(0.35, 4.5, 36), tips]))
     found = ji.theory.rocking_dispersion(aspects, mus, es)
     theta, size = np.degrees(found.kinetic_angle), np.abs(found.dispersion)
@@ -440,7 +494,11 @@ def critical_angle() -> Figure:
     angle = np.degrees(ji.theory.critical_kinetic_angle(friction))
     right.plot(friction, angle, color="black", label="for every e")
     right.plot(
-        mus, np.degrees(ji.theory.critical_kinetic_angle(mus)), "o", color=COLOURS[1], ls="none"
+        mus,
+        np.degrees(ji.theory.critical_kinetic_angle(mus)),
+        "o",
+        color=COLOURS[1],
+        ls="none",
     )
     right.set_xlabel(r"friction ratio $\mu$")
     right.set_ylabel("critical kinetic angle [degrees]")
@@ -460,7 +518,13 @@ def dispersion() -> Figure:
         jnp.asarray(found.velocity)
     )
     for i, eta in enumerate(found.exponents):
-        axes.plot(found.ratios, spread[i], color=COLOURS[i], lw=2, label=rf"LZB, $\eta$ = {eta:g}")
+        axes.plot(
+            found.ratios,
+            spread[i],
+            color=COLOURS[i],
+            lw=2,
+            label=rf"LZB, $\eta$ = {eta:g}",
+        )
     for name, style in (("binary", "--"), ("moreau", ":")):
         level = float(ji.theory.energy_dispersion(balls, found.laws[name]))
         axes.axhline(level, color="black", ls=style, label=name)

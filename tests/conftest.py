@@ -34,7 +34,10 @@ WORTH_SHARING = "0.2"  # seconds
 
 # XLA's newer emitters of loops take twice as long to compile; users compile batches with them. A
 # program that is cut into parts for several cores takes a fifth longer where each core has a test.
-QUICK = "--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"
+QUICK = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",
+)
 QUICK_IN = [(0, 10)]  # versions of JAX whose compiler is known to have these options
 
 BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs
@@ -67,7 +70,9 @@ def optimize(fully):
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     optimize(False)
-    os.environ.setdefault("JIMPACT_CACHE", "")  # commands keep nothing in the user's folder
+    os.environ.setdefault(
+        "JIMPACT_CACHE", ""
+    )  # commands keep nothing in the user's folder
     if hasattr(config, "workerinput"):
         return
     flags = os.environ.get("XLA_FLAGS", "")
@@ -80,7 +85,9 @@ def pytest_configure(config):
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = WORTH_SHARING
         jax.config.update("jax_compilation_cache_dir", folder.name)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", float(WORTH_SHARING))
+        jax.config.update(
+            "jax_persistent_cache_min_compile_time_secs", float(WORTH_SHARING)
+        )
 
 
 def stem_of(nodeid):

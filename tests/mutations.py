@@ -243,11 +243,25 @@ def run(mutation):
             else:
                 shutil.copy(ROOT / part, folder / part)
         (folder / path.relative_to(ROOT)).write_text(text, encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-x", "-q", "--no-header"]
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-p",
+            "no:xdist",
+            "-x",
+            "-q",
+            "--no-header",
+        ]
         command += ["-o", "addopts=--import-mode=importlib", "--tb=no", "-rfE"]
         command += [node_of(test) for test in mutation.tests]
         environment = os.environ | {"PYTHONPATH": name, "JAX_PLATFORMS": "cpu"}
-        options = {"cwd": folder, "env": environment, "capture_output": True, "text": True}
+        options = {
+            "cwd": folder,
+            "env": environment,
+            "capture_output": True,
+            "text": True,
+        }
         try:
             session = subprocess.run(command, timeout=ENDLESS, **options)
         except subprocess.TimeoutExpired:
@@ -256,24 +270,41 @@ def run(mutation):
     failures = re.findall(r"^(?:FAILED|ERROR) (\S+)", session.stdout, re.M)
     if session.returncode == pytest.ExitCode.OK:
         return "MISSED", seconds, ""
-    if session.returncode in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+    if session.returncode in (
+        pytest.ExitCode.USAGE_ERROR,
+        pytest.ExitCode.NO_TESTS_COLLECTED,
+    ):
         return "NO TEST", seconds, ""
-    return "caught", seconds, failures[0] if failures else session.stdout.splitlines()[-1]
+    return (
+        "caught",
+        seconds,
+        failures[0] if failures else session.stdout.splitlines()[-1],
+    )
 
 
 def main():
     """Print a row for each mutation; exit with 1 if one is not caught."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", help="parts of names of mutations; default: all")
-    parser.add_argument("--places", action="store_true", help="only print the place of each")
+    parser.add_argument(
+        "names", nargs="*", help="parts of names of mutations; default: all"
+    )
+    parser.add_argument(
+        "--places", action="store_true", help="only print the place of each"
+    )
     options = parser.parse_args()
-    chosen = [m for m in MUTATIONS if not options.names or any(x in m.name for x in options.names)]
+    chosen = [
+        m
+        for m in MUTATIONS
+        if not options.names or any(x in m.name for x in options.names)
+    ]
     uncaught = 0
     print("| mutation | verdict | seconds | noticed by |\n|---|---|---|---|")
     for mutation in chosen:
         if options.places:
             files = [str(path.relative_to(ROOT)) for path, _ in places(mutation)]
-            verdict = files[0] if len(files) == 1 else f"no such place ({len(files)} matches)"
+            verdict = (
+                files[0] if len(files) == 1 else f"no such place ({len(files)} matches)"
+            )
             uncaught += len(files) != 1
             print(f"| {mutation.name} | {verdict} | | |")
             continue

@@ -34,16 +34,22 @@ class Row:
     accuracy: float = 1e-12  # of v+, relative to the largest speed
     slope: float = 1e-10  # of forward against reverse derivatives
     by_order: bool = False  # the order of the contacts is part of the law
-    reverse: bool = True  # whether reverse derivatives are compiled as well; else its code is LZB's
+    reverse: bool = (
+        True  # whether reverse derivatives are compiled as well; else its code is LZB's
+    )
     through_w: bool = True  # whether contacts influence each other through W only
-    flagged: float = 0.05  # most of the contract's random states that may be flagged as failures
+    flagged: float = (
+        0.05  # most of the contract's random states that may be flagged as failures
+    )
 
 
 LAWS = {
     "newton": Row("newton", lambda e, k, eta, stored: ji.Newton(e), flagged=0.8),
     "moreau": Row("moreau", lambda e, k, eta, stored: ji.Moreau(e), flagged=0.5),
     "poisson": Row(
-        "poisson", lambda e, k, eta, stored: ji.Poisson(e, allow_above_one=True), flagged=0.25
+        "poisson",
+        lambda e, k, eta, stored: ji.Poisson(e, allow_above_one=True),
+        flagged=0.25,
     ),
     "matrix": Row(
         "restitution_matrix",
@@ -58,9 +64,13 @@ LAWS = {
         flagged=0.5,
     ),
     "binary": Row("binary", lambda e, k, eta, stored: ji.Binary(e)),
-    "binary-earliest": Row("binary", lambda e, k, eta, stored: ji.Binary(e, order="earliest")),
+    "binary-earliest": Row(
+        "binary", lambda e, k, eta, stored: ji.Binary(e, order="earliest")
+    ),
     "binary-left": Row(
-        "binary", lambda e, k, eta, stored: ji.Binary(e, order="left_to_right"), by_order=True
+        "binary",
+        lambda e, k, eta, stored: ji.Binary(e, order="left_to_right"),
+        by_order=True,
     ),
     "correlation": Row(
         "impulse_correlation",
@@ -68,7 +78,9 @@ LAWS = {
         1e-11,
         flagged=0.35,
     ),
-    "routh": Row("routh", lambda e, k, eta, stored: ji.Routh(e), through_w=False, flagged=0.5),
+    "routh": Row(
+        "routh", lambda e, k, eta, stored: ji.Routh(e), through_w=False, flagged=0.5
+    ),
     "lzb": Row(
         "lzb",
         lambda e, k, eta, stored: ji.LZB(e, k, eta, stored, max_steps=PASSES),
@@ -77,7 +89,9 @@ LAWS = {
     ),
     "compliant": Row(
         "compliant",
-        lambda e, k, eta, stored: ji.Compliant(ji.Bistiffness(k, eta, e), max_steps=PASSES),
+        lambda e, k, eta, stored: ji.Compliant(
+            ji.Bistiffness(k, eta, e), max_steps=PASSES
+        ),
         1e-7,
         1e-9,
         reverse=False,
@@ -189,7 +203,10 @@ def both_ways(function):
     return run
 
 
-OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+OPTIMIZED = {
+    "xla_backend_optimization_level": 3,
+    "xla_llvm_disable_expensive_passes": False,
+}
 
 
 @functools.cache
@@ -203,7 +220,9 @@ def values(name):
         for begin in range(0, len(states), LANES):
             at = np.arange(begin, begin + LANES).clip(max=len(states) - 1)
             part = program(*(column[at] for column in columns))
-            parts.append(jax.tree.map(lambda x, b=begin: np.asarray(x)[: len(states) - b], part))
+            parts.append(
+                jax.tree.map(lambda x, b=begin: np.asarray(x)[: len(states) - b], part)
+            )
         return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
     return run

@@ -22,11 +22,15 @@ def chain_matrices(masses, wall=False):
     return np.diag(masses), normals
 
 
-def lzb_oracle(mass, normals, velocity, k, e, eta, u0=0.0, tol=1e-12, slack=1e-11, max_phases=400):
+def lzb_oracle(
+    mass, normals, velocity, k, e, eta, u0=0.0, tol=1e-12, slack=1e-11, max_phases=400
+):
     """(v+, p, duration, maximum force) of the LZB law, by scipy."""
     mass, normals = np.asarray(mass, float), np.asarray(normals, float)
     m = normals.shape[1]
-    k, e, eta, u0 = (np.broadcast_to(np.asarray(z, float), (m,)).copy() for z in (k, e, eta, u0))
+    k, e, eta, u0 = (
+        np.broadcast_to(np.asarray(z, float), (m,)).copy() for z in (k, e, eta, u0)
+    )
     w = normals.T @ np.linalg.solve(mass, normals)
     gamma0 = normals.T @ np.asarray(velocity, float)
     x = ((eta + 1) * u0 / k) ** (1 / (eta + 1))
@@ -111,5 +115,7 @@ def linear_three_balls(gamma, t):
     values, vectors = np.linalg.eigh(-matrix)
     omega = np.sqrt(np.maximum(values, 0))
     start = vectors.T @ np.array([1.0, 0, 0])
-    moved = np.where(omega > 1e-12, np.sin(omega * t) / np.where(omega > 1e-12, omega, 1), t)
+    moved = np.where(
+        omega > 1e-12, np.sin(omega * t) / np.where(omega > 1e-12, omega, 1), t
+    )
     return vectors @ (moved * start), vectors @ (np.cos(omega * t) * start)

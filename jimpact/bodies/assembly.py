@@ -42,72 +42,76 @@ from jimpact.tools.checks import (
 )
 from jimpact.tools.compiling import full_precision, precise_jit
 
-# Bodies above which a grid finds the closed contacts, unless their `pairs` are named. Ten times
-# more, and time stepping looks at thousands of pairs in each step.
+# Bodies above which a grid finds the closed contacts, unless their `pairs` are named.
+# Ten times more, and time stepping looks at thousands of pairs in each step.
 FEW = 10
 
-# Contacts per body that may be closed by default: equal discs have 3, equal spheres 6, and walls;
-# polygons two for each. Ten times more takes ten times the memory.
+# Contacts per body that may be closed by default: equal discs have 3, equal spheres 6,
+# and walls; polygons two for each. Ten times more takes ten times the memory.
 ROOM = {"discs": 4, "polygons": 6, "spheres": 7}
 
-# Penetration over the least radius with which motions may start: each impact of a step leaves up
-# to h v / 2. Ten times more would start with bodies in each other.
+# Penetration over the least radius with which motions may start: each impact of a step
+# leaves up to h v / 2. Ten times more would start with bodies in each other.
 _OVERLAP = 0.1
 
-# Gap over the least radius up to which bodies touch but for rounding. Ten times more closes gaps of
-# 10 nm of bodies of a metre.
+# Gap over the least radius up to which bodies touch but for rounding. Ten times more
+# closes gaps of 10 nm of bodies of a metre.
 _TOUCHING = 1e-9
 
 
 class Bodies(RigidBodies):
-    """Bodies on planes and on each other, in the plane or in space; q holds one after the other.
+    """Bodies on planes and on each other, in plane or space, one after the other.
 
     Equation: on a plane `n . x >= c` each contact point of a body has
     `f = n . (x + R c_i) - r - c`,
-    round bodies `f = |x_1 - x_2| - r_1 - r_2`; a disc or sphere has its distance from a polygon or
-    box. Two polygons have the two contacts of two sides that face each other: at each end of the
-    first side, the distance of its corner from the second side, or, if that is less, that of the
-    second side's end from the first side; the least of both is the distance of the polygons.
-    Normals are unit vectors n from the second body to the first one, in the plane tangents are
-    (n_y, -n_x); both as rates of q. Contacts, in order: for each plane and body, its contact
-    points; then pairs of round bodies; round ones on those with faces; polygons, two contacts a
-    pair. `between` names their bodies.
+    round bodies `f = |x_1 - x_2| - r_1 - r_2`; a disc or sphere has its distance from a
+    polygon or box. Two polygons have the two contacts of two sides that face each
+    other: at each end of the first side, the distance of its corner from the second
+    side, or, if that is less, that of the second side's end from the first side; the
+    least of both is the distance of the polygons. Normals are unit vectors n from the
+    second body to the first one, in the plane tangents are (n_y, -n_x); both as rates
+    of q. Contacts, in order: for each plane and body, its contact points; then pairs of
+    round bodies; round ones on those with faces; polygons, two contacts a pair.
+    `between` names their bodies.
 
-    Few bodies have all their contacts. Polygons choose their sides as they move, so that they may
-    roll over their corners, slide off each other and meet again anywhere. Of two in touch, one with
-    an odd number of sides, one with an even number, the normal from the first to the second must
-    not pass 2 rad (`valid`). In the plane gaps of discs hold while their centres are outside other
-    bodies; inside a box `f < 0` is the depth below its nearest face. Bodies that are no pair do not
-    feel each other.
+    Few bodies have all their contacts. Polygons choose their sides as they move, so
+    that they may roll over their corners, slide off each other and meet again anywhere.
+    Of two in touch, one with an odd number of sides, one with an even number, the
+    normal from the first to the second must not pass 2 rad (`valid`). In the plane gaps
+    of discs hold while their centres are outside other bodies; inside a box `f < 0` is
+    the depth below its nearest face. Bodies that are no pair do not feel each other.
 
     Many discs, polygons and spheres are a pile: a grid finds closed contacts in
-    `simulate(method="time_stepping")`, `closed_scene(q)` is the scene of those at q, and spheres
-    keep three turns [rad] in the place of a quaternion, in the axes of space. `at(positions)` gives
-    q, not turned.
+    `simulate(method="time_stepping")`, `closed_scene(q)` is the scene of those at q,
+    and spheres keep three turns [rad] in the place of a quaternion, in the axes of
+    space. `at(positions)` gives q, not turned.
 
     Args:
-        bodies: in the plane `Polygon`, `Block`, `Disc`, on planes only `Dimer`; in space `Box`,
-            `Sphere`, on planes only `SpatialDimer` and a `Coin` with corners (their own `normal`
-            does not count).
-        planes: rows (n_x, n_y, c), in space (n_x, n_y, n_z, c) [m]; n is made a unit vector. In the
-            plane also an angle a [rad], or (a, c): 0 is level, pi/2 a wall on the right. None: the
-            ground; (): none.
-        pairs: (i, j) of bodies, counted from 0, the fixed ones after the others, in contact with
-            each other; None: all of which one moves. Two boxes have no gap function: `from_mujoco`
-            finds their contacts at one instant, or at each time step.
+        bodies: in the plane `Polygon`, `Block`, `Disc`, on planes only `Dimer`; in
+            space `Box`, `Sphere`, on planes only `SpatialDimer` and a `Coin` with
+            corners (their own `normal` does not count).
+        planes: rows (n_x, n_y, c), in space (n_x, n_y, n_z, c) [m]; n is made a unit
+            vector. In the plane also an angle a [rad], or (a, c): 0 is level, pi/2 a
+            wall on the right. None: the ground; (): none.
+        pairs: (i, j) of bodies, counted from 0, the fixed ones after the others, in
+            contact with each other; None: all of which one moves. Two boxes have no gap
+            function: `from_mujoco` finds their contacts at one instant, or at each time
+            step.
         fixed: bodies that do not move, or only with the base: finite walls, tables.
         places: q of each fixed one, a row each.
-        room: of many bodies, the largest number of closed contacts at once; given, bodies are many
-            whatever their number. None: 4 a disc, 6 a polygon, 7 a sphere. Without it there are
-            many from 11 on, unless `pairs` or `fixed` are given.
+        room: of many bodies, the largest number of closed contacts at once; given,
+            bodies are many whatever their number. None: 4 a disc, 6 a polygon, 7 a
+            sphere. Without it there are many from 11 on, unless `pairs` or `fixed` are
+            given.
 
     Raises:
-        ValueError: no bodies or contacts, planes or places that are not finite, planes without a
-            normal, pairs that do not exist or of two boxes, `room` besides pairs or fixed bodies.
+        ValueError: no bodies or contacts, planes or places that are not finite, planes
+            without a normal, pairs that do not exist or of two boxes, `room` besides
+            pairs or fixed bodies.
         TypeError: other bodies, or some in the plane and some in space.
 
-    Source: Ericson, Real-Time Collision Detection (2005), ch. 5 (nearest points, separating axes)
-    and 7 (grids).
+    Source: Ericson, Real-Time Collision Detection (2005), ch. 5 (nearest points,
+    separating axes) and 7 (grids).
 
     >>> import jimpact as ji
     >>> slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
@@ -117,7 +121,9 @@ class Bodies(RigidBodies):
     >>> stack.scene([0.0, 0.5, 0.0, 0.3, 1.5, 0.0]).gaps[-2:].tolist()
     [0.0, 0.0]
     >>> wall = ji.Box([0.1, 2.0, 1.0])
-    >>> ball = ji.Bodies([ji.Sphere(0.1)], fixed=[wall], places=[wall.at([0.55, 0.0, 0.5])])
+    >>> ball = ji.Bodies(
+    ...     [ji.Sphere(0.1)], fixed=[wall], places=[wall.at([0.55, 0.0, 0.5])]
+    ... )
     >>> q = ball.at([[0.2, 0.0, 0.3]])
     >>> [round(float(f), 6) for f in ball.scene(q).gaps]  # over the ground, to the wall
     [0.2, 0.2]
@@ -128,7 +134,8 @@ class Bodies(RigidBodies):
     """
 
     places: jax.Array  # (f, ..) coordinates of the fixed bodies
-    pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)  # None: by the grid
+    # None: by the grid
+    pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)
     room: int = eqx.field(static=True)  # 0 of few
     crowd: int = eqx.field(static=True)  # see `near_pairs`; 0: every pair is looked at
 
@@ -141,11 +148,16 @@ class Bodies(RigidBodies):
         places: Any = (),
         room: int | None = None,
     ):
-        """Check the arguments, stack the arrays of all bodies, and choose the pairs or the grid."""
+        """Check the arguments, stack the arrays of all bodies, and choose the pairs or
+        the grid.
+        """
         for name, some in (("bodies", bodies), ("fixed", fixed)):
             if not np.iterable(some):
-                raise TypeError(f"Argument `{name}` must be a list of bodies, but is {some!r}.")
-        bodies, fixed = tuple(bodies), tuple(fixed)
+                raise TypeError(
+                    f"Argument `{name}` must be a list of bodies, but is {some!r}."
+                )
+        bodies = tuple(bodies)
+        fixed = tuple(fixed)
         every = (*bodies, *fixed)
         if not bodies:
             raise ValueError("Argument `bodies` must hold one or more, but is empty.")
@@ -153,22 +165,40 @@ class Bodies(RigidBodies):
         d = bodies[0].dimension
         named = pairs is not None or len(fixed) > 0
         if room is not None and named:
-            raise ValueError("Argument `room` must be left out with `pairs` or `fixed`.")
+            raise ValueError(
+                "Argument `room` must be left out with `pairs` or `fixed`."
+            )
         self.shapes = tuple(body.shapes[0] for body in every)
-        many = (room is not None or len(bodies) > FEW) and not named and self._may_be_many(d)
+        many = (
+            (room is not None or len(bodies) > FEW)
+            and not named
+            and self._may_be_many(d)
+        )
         if room is not None and not many:
             names = ", ".join(sorted({type(body).__name__ for body in bodies}))
-            raise TypeError(f"Argument `bodies` must be discs, polygons or spheres, not {names}.")
+            raise TypeError(
+                f"Argument `bodies` must be discs, polygons or spheres, not {names}."
+            )
         self.masses = _stacked([body.masses[0] for body in bodies])
         self.inertias = _stacked(_alike([body.inertias[0] for body in bodies]))
         self.points = _stacked(_padded(every))
         self.rims = _stacked([body.rims[0] for body in every])
         self.planes = as_planes(planes, d).astype(self.points.dtype)
-        self.room, self.pairs, self.crowd = 0, None, 0
+        self.room = 0
+        self.pairs = None
+        self.crowd = 0
         self.places = as_float_array("places", places).reshape(-1, 3 if d == 2 else 7)
         if many:
-            kinds = "spheres" if d == 3 else "discs" if self.points.shape[1] == 1 else "polygons"
-            self.room = ROOM[kinds] * self.count if room is None else as_whole("room", room, 1)
+            if d == 3:
+                kinds = "spheres"
+            elif self.points.shape[1] == 1:
+                kinds = "discs"
+            else:
+                kinds = "polygons"
+            if room is None:
+                self.room = ROOM[kinds] * self.count
+            else:
+                self.room = as_whole("room", room, 1)
             self.crowd = grid.crowd_of_cells(self)
             return
         size = (len(fixed), self.places.shape[1])
@@ -179,10 +209,14 @@ class Bodies(RigidBodies):
                 unit_quaternion(place[3:])
         self.pairs = _as_pairs(every, self.shapes, len(bodies), d, pairs)
         if not len(self.pairs_in_contact()):
-            raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
+            raise ValueError(
+                "Arguments `bodies`, `planes` and `pairs` must give a contact."
+            )
 
     def _may_be_many(self, d: int) -> bool:
-        """True if the grid can find their contacts: discs and polygons, or centred spheres."""
+        """True if the grid can find their contacts: discs and polygons, or centred
+        spheres.
+        """
         return all(s.centred if d == 3 else s.faces or s.is_round for s in self.shapes)
 
     @property
@@ -194,8 +228,9 @@ class Bodies(RigidBodies):
 
     @property
     def _kinds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs (g, 2) of bodies in contact by kind: two round ones; a round one first and one with
-        faces (polygon, box); two with faces."""
+        """Pairs (g, 2) of bodies in contact by kind: two round ones; a round one first
+        and one with faces (polygon, box); two with faces.
+        """
         if self.pairs is None:
             each = np.stack(np.triu_indices(self.count, 1), axis=1).astype(np.int32)
         else:
@@ -205,7 +240,8 @@ class Bodies(RigidBodies):
             return each, each[:0], each[:0]
         is_round = round_bodies[each]
         one_round = is_round.sum(axis=1) == 1
-        mixed, first_round = each[one_round], is_round[one_round, :1]
+        mixed = each[one_round]
+        first_round = is_round[one_round, :1]
         mixed = np.where(first_round, mixed, mixed[:, ::-1])
         return each[is_round.all(axis=1)], mixed, each[~is_round.any(axis=1)]
 
@@ -223,9 +259,13 @@ class Bodies(RigidBodies):
         return jnp.concatenate([self.of_bodies(q), self.places.astype(q.dtype)])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps (m,), points and normals (m, ..) at q, and the bodies of each contact."""
-        placed, rims = self.placed(q), self.rims
-        points, parts = placed.points, [self.on_planes(placed.points)]
+        """Gaps (m,), points and normals (m, ..) at q, and the bodies of each
+        contact.
+        """
+        placed = self.placed(q)
+        rims = self.rims
+        points = placed.points
+        parts = [self.on_planes(placed.points)]
         discs, mixed, faces = self._kinds
         if len(discs):
             i, j = discs.T
@@ -234,15 +274,21 @@ class Bodies(RigidBodies):
             parts.append(self._round_on_faces(placed, *mixed.T))
         if len(faces):
             i, j = faces.T
-            a, b = points[i], points[j]
+            a = points[i]
+            b = points[j]
             facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # indices of sides
-            counts, angles = self._counts, self.all_bodies(q)[:, 2]
-            at, sizes = (angles[i], angles[j]), (counts[i], counts[j])
-            # which of the two contacts of a pair comes first, so that one keeps its place where a
-            # body rolls over a corner and another side faces the other body
+            counts = self._counts
+            angles = self.all_bodies(q)[:, 2]
+            at = (angles[i], angles[j])
+            sizes = (counts[i], counts[j])
+            # which of the two contacts of a pair comes first, so that one keeps its
+            # place where a body rolls over a corner and another side faces the other
+            # body
             swapped = changed_places((a, b), at, sizes, facing)
             two_each = polygon_on_polygon(a, b, facing, swapped)  # (g, 2, ..)
-            parts.append(ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in two_each)))
+            parts.append(
+                ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in two_each))
+            )
         return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     @property
@@ -250,42 +296,56 @@ class Bodies(RigidBodies):
         """Points (b,) of each body."""
         return np.array([shape.size for shape in self.shapes])
 
-    def _round_on_faces(self, placed: Placed, i: np.ndarray, j: np.ndarray) -> ContactPoints:
+    def _round_on_faces(
+        self, placed: Placed, i: np.ndarray, j: np.ndarray
+    ) -> ContactPoints:
         """Contacts (g,) of discs i with polygons j, in space of spheres i with boxes j.
 
-        A box is rounded by its rim r_j, a sphere has the radius r_i: `f = d - r_j - r_i`, d the
-        distance of the sphere's middle from the box of the points.
+        A box is rounded by its rim r_j, a sphere has the radius r_i:
+        `f = d - r_j - r_i`, d the distance of the sphere's middle from the box of the
+        points.
         """
-        points, turns, rims = placed.points, placed.turns, self.rims
+        points = placed.points
+        turns = placed.turns
+        rims = self.rims
         if self.dimension == 2:
             return disc_on_polygon(points[i, 0], rims[i], points[j])
         middle = 0.5 * (points[j, 0] + points[j, -1])
         half = 0.5 * (self.points[j, -1] - self.points[j, 0])  # sizes of the boxes
-        from_middle = times(jnp.swapaxes(turns[j], 1, 2), points[i, 0] - middle)  # in their axes
+        # in their axes
+        from_middle = times(jnp.swapaxes(turns[j], 1, 2), points[i, 0] - middle)
         distance, n = from_box(from_middle, half)
-        normal, away = times(turns[j], n), distance - rims[j]
-        return ContactPoints(away - rims[i], points[i, 0] - away[:, None] * normal, normal)
+        normal = times(turns[j], n)
+        away = distance - rims[j]
+        return ContactPoints(
+            away - rims[i], points[i, 0] - away[:, None] * normal, normal
+        )
 
     @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
         """The least margin (): >= 0 where the gap function holds at q, see the class.
 
-        In the plane margins are distances [m] of the centres of discs from each other and from
-        polygons, and `margin_of_places`. Many bodies, and bodies in space, have none of these.
+        In the plane margins are distances [m] of the centres of discs from each other
+        and from polygons, and `margin_of_places`. Many bodies, and bodies in space,
+        have none of these.
         """
         margin = super().valid(q)
         if self.room or self.dimension == 3:
             return margin
-        placed, margins = self.placed(q), [margin[None]]
+        placed = self.placed(q)
+        margins = [margin[None]]
         points = placed.points
         discs, mixed, faces = self._kinds
         if len(discs):
             margins.append(lengths(points[discs[:, 0], 0] - points[discs[:, 1], 0])[0])
         if len(mixed):
-            margins.append(self._round_on_faces(placed, *mixed.T).gap + self.rims[mixed[:, 0]])
+            margins.append(
+                self._round_on_faces(placed, *mixed.T).gap + self.rims[mixed[:, 0]]
+            )
         odd = self._counts[faces].sum(axis=1) % 2 == 1
         if odd.any():
-            a, b = points[faces[odd, 0]], points[faces[odd, 1]]
+            a = points[faces[odd, 0]]
+            b = points[faces[odd, 1]]
             margins.append(margin_of_places((a, b), facing_sides(a, b)))
         return jnp.min(jnp.concatenate(margins))
 
@@ -299,20 +359,27 @@ class Bodies(RigidBodies):
     def touching(
         self, angle: Any = 0.0, along: Any = 0.0, body: int = 0, plane: int = 0
     ) -> jax.Array:
-        """(x, y, theta) of one body that touches one plane, turned by `angle` [rad] against it.
+        """(x, y, theta) of one body that touches one plane, turned by `angle` [rad]
+        against it.
 
-        Its centre of mass is at the distance `along` [m] from the foot of the origin on the plane.
+        Its centre of mass is at the distance `along` [m] from the foot of the origin on
+        the plane.
         """
         if self.dimension == 3 or not len(self.planes):
             raise TypeError(
-                "Bodies in space or without planes have no `touching`: give `q` yourself, see `at`."
+                "Bodies in space or without planes have no `touching`: give `q` "
+                "yourself, see `at`."
             )
         check_choice("body", body, range(self.count))
         check_choice("plane", plane, range(len(self.planes)))
-        turn, distance = number("angle", angle), number("along", along)
+        turn = number("angle", angle)
+        distance = number("along", along)
         (n_x, n_y, offset) = self.planes[plane]
         # heights of its points over the centre of mass, along the normal
-        heights = jnp.sin(turn) * self.points[body, :, 0] + jnp.cos(turn) * self.points[body, :, 1]
+        heights = (
+            jnp.sin(turn) * self.points[body, :, 0]
+            + jnp.cos(turn) * self.points[body, :, 1]
+        )
         up = offset + self.rims[body] - jnp.min(heights)
         place = [n_y * distance + n_x * up, n_y * up - n_x * distance]
         return jnp.stack([*place, turn + jnp.arctan2(-n_x, n_y)])
@@ -321,65 +388,88 @@ class Bodies(RigidBodies):
 
     @property
     def pair_count(self) -> int | None:
-        """Number of contacts of pairs (i, j), in both orders, and of corners with planes."""
-        return grid.slots(self) * self.count * grid.stride(self) if self.room else None
+        """Number of contacts of pairs (i, j), in both orders, and of corners with
+        planes.
+        """
+        if self.room:
+            return grid.slots(self) * self.count * grid.stride(self)
+        return None
 
     @property
     def overlap(self) -> Any:
         """Penetration () [m] with which a motion may start."""
-        return _OVERLAP * grid.least_radius(self) if self.room else 0.0
+        if self.room:
+            return _OVERLAP * grid.least_radius(self)
+        return 0.0
 
-    def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
+    def active_pairs(
+        self, q: jax.Array, later: jax.Array, below: jax.Array
+    ) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` () [m] at q or `later`."""
         return grid.active_pairs(self, q, later, below)
 
     def least_gap(self, q: jax.Array) -> jax.Array:
-        """The least gap () [m]; of many, of bodies that are near each other if there are any."""
-        return grid.least_gap(self, q) if self.room else super().least_gap(q)
+        """The least gap () [m]; of many, of bodies that are near each other if there
+        are any.
+        """
+        if self.room:
+            return grid.least_gap(self, q)
+        return super().least_gap(q)
 
     def closed_scene(self, q: Any, below: Any = None) -> Scene:
-        """The contacts of many bodies at q that are closed, as a scene without friction.
+        """The contacts of many bodies at q that are closed, as a scene without
+        friction.
 
-        Only normals of two bodies each are stored, and W has few entries in a row: an impact of
-        `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
-        pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
-        `TimeStepping.contacts` has friction.
+        Only normals of two bodies each are stored, and W has few entries in a row: an
+        impact of `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts
+        cost. (`scene` holds all pairs and every gap.) Which bodies touch is compiled
+        in: every packing compiles anew. `TimeStepping.contacts` has friction.
 
         Args:
             q: (n,), see `at`; not traced.
-            below: gap >= 0 [m] up to which contacts count as closed; None: 1e-9 of the least
-                radius.
+            below: gap >= 0 [m] up to which contacts count as closed; None: 1e-9 of the
+                least radius.
 
         Returns:
-            `Scene` of n velocities; contacts of bodies i < j first, then those with planes.
+            `Scene` of n velocities; contacts of bodies i < j first, then those with
+            planes.
 
         Raises:
-            ValueError: nothing touches, more than `room` do, a bad `below`, two bodies in one
-                place. A warning says where bodies overlap by more than a tenth of the least radius.
+            ValueError: nothing touches, more than `room` do, a bad `below`, two bodies
+                in one place. A warning says where bodies overlap by more than a tenth
+                of the least radius.
             TypeError: few bodies, which have `scene`.
         """
         if not self.room:
-            raise TypeError("Few bodies have no `closed_scene`: take `scene`, or give `room`.")
+            raise TypeError(
+                "Few bodies have no `closed_scene`: take `scene`, or give `room`."
+            )
         q = as_float_array("q", q)
         check_concrete("q", q)
         check_shape("q", q, self.mass.shape, "one number per velocity")
         check_values("q", q)
-        below = _TOUCHING * float(grid.least_radius(self)) if below is None else below
+        if below is None:
+            below = _TOUCHING * float(grid.least_radius(self))
         check_values("below", below, low=0.0)
-        pairs, least = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
+        pairs, least = jax.device_get(
+            _active_pairs(self, q, jnp.asarray(below, q.dtype))
+        )
         if least < -float(self.overlap):
             warnings.warn(
-                f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals mean little "
+                f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals "
+                f"mean little "
                 "there.",
                 stacklevel=2,
             )
         if not pairs.filled:
             raise ValueError(
-                f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."
+                f"Argument `q` must hold bodies that touch, but no gap is up to "
+                f"{below:g}."
             )
         if pairs.overflows:
             raise ValueError(
-                f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
+                f"Argument `q` must hold at most {self.room} contacts (the argument "
+                f"`room` of "
                 "`Bodies`), but holds more."
             )
         listed = listed_pairs(pairs, self.mass)
@@ -389,17 +479,24 @@ class Bodies(RigidBodies):
 
 
 @precise_jit
-def _active_pairs(bodies: Bodies, q: jax.Array, below: jax.Array) -> tuple[ActivePairs, jax.Array]:
+def _active_pairs(
+    bodies: Bodies, q: jax.Array, below: jax.Array
+) -> tuple[ActivePairs, jax.Array]:
     """The contacts with gaps up to `below` () [m] at q, and the least gap () [m]."""
     return bodies.active_pairs(q, q, below), bodies.least_gap(q)
 
 
-# ------------------------------------------------------------------------------ construction
+# ------------------------------------------------------------------------------
+# construction
 
 
 def _stacked(rows: Sequence[jax.Array]) -> jax.Array:
-    """Arrays of one shape; on the host where they are known: JAX takes long to stack thousands."""
-    return jnp.stack(rows) if is_traced(rows) else jnp.asarray(np.array(rows))
+    """Arrays of one shape; on the host where they are known: JAX takes long to stack
+    thousands.
+    """
+    if is_traced(rows):
+        return jnp.stack(rows)
+    return jnp.asarray(np.array(rows))
 
 
 def _alike(inertias: Sequence[jax.Array]) -> list[jax.Array]:
@@ -410,7 +507,9 @@ def _alike(inertias: Sequence[jax.Array]) -> list[jax.Array]:
 
 
 def _padded(bodies: Sequence[RigidBody]) -> list[Any]:
-    """Points (P, d) [m] of each body, its last one repeated up to the largest number P."""
+    """Points (P, d) [m] of each body, its last one repeated up to the largest number
+    P.
+    """
     most = max(body.points.shape[1] for body in bodies)
     pad = jnp if is_traced([body.points for body in bodies]) else np
     return [
@@ -420,23 +519,28 @@ def _padded(bodies: Sequence[RigidBody]) -> list[Any]:
 
 
 def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
-    """Raise a TypeError for entries without contact points, or of another dimension than others."""
+    """Raise a TypeError for entries without contact points, or of another dimension
+    than others.
+    """
     for name, some in (("bodies", bodies), ("fixed", fixed)):
         for body in some:
             kind = type(body).__name__
             if not isinstance(body, RigidBody):
                 raise TypeError(
-                    f"Argument `{name}` must hold bodies with contact points (`RigidBody`), but "
+                    f"Argument `{name}` must hold bodies with contact points "
+                    f"(`RigidBody`), but "
                     f"holds one of type {kind}."
                 )
             if body.dimension != bodies[0].dimension:
                 raise TypeError(
-                    f"Argument `{name}` must hold planar bodies, or bodies in space only, but "
+                    f"Argument `{name}` must hold planar bodies, or bodies in space "
+                    f"only, but "
                     f"holds a {kind}."
                 )
             if not body.points.shape[1]:
                 raise TypeError(
-                    f"Argument `{name}` must hold bodies with contact points, but holds a {kind} "
+                    f"Argument `{name}` must hold bodies with contact points, but "
+                    f"holds a {kind} "
                     "with round rims: give it `corners`."
                 )
 
@@ -448,7 +552,8 @@ def _as_pairs(
     d: int,
     pairs: Sequence[Any] | None,
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs (i, j) of bodies that have a gap function; raise a ValueError for others in `pairs`.
+    """Pairs (i, j) of bodies that have a gap function; raise a ValueError for others in
+    `pairs`.
 
     Args:
         every: bodies, the first `moving` ones of which move, others are fixed.
@@ -469,21 +574,28 @@ def _as_pairs(
             and max(pair) < count
             and pair[0] != pair[1]
         ):
-            fixed = f", one of which moves (0 to {moving - 1})" if count > moving else ""
+            if count > moving:
+                fixed = f", one of which moves (0 to {moving - 1})"
+            else:
+                fixed = ""
             raise ValueError(
-                f"Argument `pairs` must join different bodies, bodies 0 to {count - 1}{fixed}, but "
+                f"Argument `pairs` must join different bodies, bodies 0 to "
+                f"{count - 1}{fixed}, but "
                 f"holds {pair!r}."
             )
         for i in pair:
             if not (shapes[i].faces or shapes[i].is_round):
                 raise ValueError(
-                    "Argument `pairs` must join discs, polygons, spheres and boxes, but body "
+                    "Argument `pairs` must join discs, polygons, spheres and boxes, "
+                    "but body "
                     f"{i} is a {type(every[i]).__name__}."
                 )
         if d == 3 and all(shapes[i].faces for i in pair):
             raise ValueError(
-                f"Argument `pairs` must leave out the pair {tuple(pair)!r}: two boxes have no gap "
-                "function. Contacts of boxes come from `jimpact.from_mujoco`, in motion at each "
+                f"Argument `pairs` must leave out the pair {tuple(pair)!r}: two boxes "
+                f"have no gap "
+                "function. Contacts of boxes come from `jimpact.from_mujoco`, in "
+                "motion at each "
                 "step (docs/mujoco.md)."
             )
     return tuple((int(i), int(j)) for i, j in pairs)

@@ -1,4 +1,6 @@
-"""The closed contacts of many bodies: the first rows of arrays of fixed length, in blocks."""
+"""The closed contacts of many bodies: the first rows of arrays of fixed length, in
+blocks.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -9,20 +11,26 @@ import numpy as np
 
 from jimpact.core.scene import Scene, sparse_scene
 
-# Contacts of a pile that are computed at once; rows without contacts are left out in such blocks.
-# Ten times more: few contacts among many bodies take as long as all of them.
+# Contacts of a pile that are computed at once; rows without contacts are left out in
+# such blocks. Ten times more: few contacts among many bodies take as long as all of
+# them.
 BLOCK = 128
 
 Carry = TypeVar("Carry")
 
 
-def over_blocks(count: jax.Array, one: Callable[[jax.Array, Carry], Carry], start: Carry) -> Carry:
-    """Result of a loop over blocks of `BLOCK` rows, as many as hold the first `count` () rows.
+def over_blocks(
+    count: jax.Array, one: Callable[[jax.Array, Carry], Carry], start: Carry
+) -> Carry:
+    """Result of a loop over blocks of `BLOCK` rows, as many as hold the first `count`
+    () rows.
 
     Equation: `carry = one(first_row, carry)` for each block, from `carry = start` on.
     """
     blocks = (count + BLOCK - 1) // BLOCK
-    return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
+    return jax.lax.fori_loop(
+        jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start
+    )
 
 
 def block(x: jax.Array, row: jax.Array) -> jax.Array:
@@ -41,19 +49,22 @@ class ActivePairs(NamedTuple):
     Rows that are not used are 0.
     """
 
-    number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
+    # (K,) of the contact among all of them; `pair_count` in unused rows
+    number: jax.Array
     closed: jax.Array  # (K,) whether the row is used
     filled: jax.Array  # () number of rows that are used
     bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
-    # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
-    # and turn in a plane, x, y, z and three turns in space
+    # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of
+    # each: x, y and turn in a plane, x, y, z and three turns in space
     directions: jax.Array
     overflows: jax.Array  # () whether more are closed than there are rows
     reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
 
 
 class ListedPairs(NamedTuple):
-    """The m closed contacts of many bodies on the host: those of two bodies first, then walls."""
+    """The m closed contacts of many bodies on the host: those of two bodies first, then
+    walls.
+    """
 
     rows: np.ndarray  # (m,) of `ActivePairs`
     bodies: np.ndarray  # (m, 2), -1 for a wall
@@ -62,12 +73,15 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(pairs: ActivePairs, mass: jax.Array) -> ListedPairs:
-    """The closed contacts of bodies with masses (n,), on the host and in order, as a scene."""
+    """The closed contacts of bodies with masses (n,), on the host and in order, as a
+    scene.
+    """
     velocities = pairs.directions.shape[3]  # of a body
     count = len(mass) // velocities
     bodies = np.where(pairs.bodies == count, -1, pairs.bodies)[: int(pairs.filled)]
     order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
-    bodies, directions = bodies[order], np.array(pairs.directions)[order]
+    bodies = bodies[order]
+    directions = np.array(pairs.directions)[order]
     directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]  # walls do not move
     scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, count)
     return ListedPairs(order, bodies, directions, scene)
@@ -76,10 +90,11 @@ def listed_pairs(pairs: ActivePairs, mass: jax.Array) -> ListedPairs:
 def chosen_rows(
     so_far: jax.Array, first: jax.Array, count: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """True (BLOCK,) for the rows from `first` on that are below `count` (), and their candidates.
+    """True (BLOCK,) for the rows from `first` on that are below `count` (), and their
+    candidates.
 
-    Equation: row k holds candidate `min {c: so_far_c = k + 1}` (BLOCK,), where `so_far` (C,) is the
-    number of chosen ones among the candidates 0 to c.
+    Equation: row k holds candidate `min {c: so_far_c = k + 1}` (BLOCK,), where `so_far`
+    (C,) is the number of chosen ones among the candidates 0 to c.
     """
     row = first + np.arange(BLOCK, dtype=np.int32)
     place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)

@@ -9,24 +9,27 @@ import numpy as np
 from jimpact.bodies.base import dot, lengths
 from jimpact.bodies.rigid import ContactPoints
 
-# [m] More than rounding: it decides neither between parallel sides nor whether a point at the end
-# of a side is over it.
+# [m] More than rounding: it decides neither between parallel sides nor whether a point
+# at the end of a side is over it.
 PARALLEL = 1e-9
-# [rad] Direction between two polygons, of which one has an odd number of sides, at which their two
-# contacts change places, see `changed_places`: none of the usual slopes.
+# [rad] Direction between two polygons, of which one has an odd number of sides, at
+# which their two contacts change places, see `changed_places`: none of the usual
+# slopes.
 _CUT = 2.0
-# 1 - cos of the angle to that direction, within which they must not touch: .8 degrees. Ten times
-# less, and steps of a motion may pass over it.
+# 1 - cos of the angle to that direction, within which they must not touch: .8 degrees.
+# Ten times less, and steps of a motion may pass over it.
 _NEAR_CUT = 1e-4
 _TOUCHING = 1e-6  # [m] gap from which they may pass it; ten times more would do
 
 
-def round_on_round(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactPoints:
+def round_on_round(
+    a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array
+) -> ContactPoints:
     """Contacts (g,) of discs or spheres about a, b (g, d) [m] of radii r, s (g,) [m].
 
-    Equation: `f = |a - b| - r - s`, `n = (a - b) / |a - b|`, from the second to the first one.
-    Forces act in the middle of the gap or overlap, `b + (s + f / 2) n`, one point of both bodies:
-    only so do they keep the angular momentum.
+    Equation: `f = |a - b| - r - s`, `n = (a - b) / |a - b|`, from the second to the
+    first one. Forces act in the middle of the gap or overlap, `b + (s + f / 2) n`, one
+    point of both bodies: only so do they keep the angular momentum.
     """
     length, n = lengths(a - b)
     gap = length - r - s
@@ -34,10 +37,12 @@ def round_on_round(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> Co
 
 
 def from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Distances (g,) [m] of points x (g, 3) from boxes `|x_i| <= half_i`, and gradients (g, 3).
+    """Distances (g,) [m] of points x (g, 3) from boxes `|x_i| <= half_i`, and gradients
+    (g, 3).
 
-    Equation: `max(|x_i| - half_i)`, the distance from a face, where at most one of these is
-    positive (negative inside); `|max(|x_i| - half_i, 0)|`, that from an edge or corner, elsewhere.
+    Equation: `max(|x_i| - half_i)`, the distance from a face, where at most one of
+    these is positive (negative inside); `|max(|x_i| - half_i, 0)|`, that from an edge
+    or corner, elsewhere.
     """
     sign = jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
     beyond = sign * x - half
@@ -48,11 +53,13 @@ def from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(over_face, jnp.max(beyond, axis=1), length), sign * n
 
 
-# ------------------------------------------------------------------------- polygons (g, K, 2)
+# ------------------------------------------------------------------------- polygons (g,
+# K, 2)
 
 
 def sides(corners: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sides (.., K, 2) of counter-clockwise polygons with `corners` (.., K, 2), and unit normals.
+    """Sides (.., K, 2) of counter-clockwise polygons with `corners` (.., K, 2), and
+    unit normals.
 
     Side i goes from corner i to the next one; one without length has the normal 0.
     """
@@ -61,48 +68,65 @@ def sides(corners: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def outward(side: jax.Array) -> jax.Array:
-    """Outward unit normals (s_y, -s_x) / |s| of counter-clockwise sides s (.., 2); 0 of s = 0."""
+    """Outward unit normals (s_y, -s_x) / |s| of counter-clockwise sides s (.., 2); 0 of
+    s = 0.
+    """
     square = dot(side, side)[..., None]
     turned = jnp.stack([side[..., 1], -side[..., 0]], axis=-1)
     return turned / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
-def disc_on_polygon(middle: jax.Array, rim: jax.Array, corners: jax.Array) -> ContactPoints:
-    """Contacts (g,) of discs about points (g, 2) of radii (g,) with polygons (g, K, 2), all in [m].
+def disc_on_polygon(
+    middle: jax.Array, rim: jax.Array, corners: jax.Array
+) -> ContactPoints:
+    """Contacts (g,) of discs about points (g, 2) of radii (g,) with polygons (g, K, 2),
+    all in [m].
 
     Equation: `f = d - r` with the distance d of the middle from the polygon.
     """
     side, normals = sides(corners)
     heights = _without_points(dot(middle[:, None] - corners, normals), normals)
-    nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
+    # outside, its side or one of its ends is the nearest
+    nearest = jnp.argmax(heights, axis=1)
     row = np.arange(len(corners))
-    away, _, n = _from_side(middle, *(x[row, nearest] for x in (corners, side, normals)))
+    away, _, n = _from_side(
+        middle, *(x[row, nearest] for x in (corners, side, normals))
+    )
     return ContactPoints(away - rim, middle - away[:, None] * n, n)
 
 
 def _from_side(
     point: jax.Array, begin: jax.Array, side: jax.Array, n: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Distances d (..) [m] of points from sides, contact points (.., 2), and normals (.., 2).
+    """Distances d (..) [m] of points from sides, contact points (.., 2), and normals
+    (.., 2).
 
-    A `side` (.., 2) starts at `begin` and has the outward unit normal n; all arrays are (.., 2).
-    A point over the side has `d = n . (point - begin)`, negative behind it, and itself is the
-    contact point. Beyond an end, d is the distance from this end, the contact point is halfway, and
-    the normal points from the end to the point.
+    A `side` (.., 2) starts at `begin` and has the outward unit normal n; all arrays are
+    (.., 2). A point over the side has `d = n . (point - begin)`, negative behind it,
+    and itself is the contact point. Beyond an end, d is the distance from this end, the
+    contact point is halfway, and the normal points from the end to the point.
     """
-    square, from_begin = dot(side, side), point - begin
+    square = dot(side, side)
+    from_begin = point - begin
     along = dot(side, from_begin)  # from 0 at the begin to |side|^2 at the end
     slack = PARALLEL * jnp.sqrt(square)
     beyond = (along < -slack) | (along > square + slack)
-    end = begin + jnp.where(along > square, 1.0, 0.0)[..., None] * side  # the nearer one
+    # the nearer one
+    end = begin + jnp.where(along > square, 1.0, 0.0)[..., None] * side
     length, toward = lengths(point - end)
     distance = jnp.where(beyond, length, dot(n, from_begin))
     beyond = beyond[..., None]
-    return distance, jnp.where(beyond, 0.5 * (point + end), point), jnp.where(beyond, toward, n)
+    return (
+        distance,
+        jnp.where(beyond, 0.5 * (point + end), point),
+        jnp.where(beyond, toward, n),
+    )
 
 
 def _without_points(heights: jax.Array, normals: jax.Array) -> jax.Array:
-    """Heights (.., k) over sides with these normals (.., k, 2); -inf over those without length."""
+    """Heights (.., k) over sides with these normals (.., k, 2); -inf over those without
+    length.
+    """
     return jnp.where(jnp.any(normals != 0, axis=-1), heights, -jnp.inf)
 
 
@@ -115,17 +139,20 @@ class Facing(NamedTuple):
 
 
 def _at_side(is_chosen: jax.Array, values: jax.Array) -> jax.Array:
-    """Entries (2, g, ..) of `values` (2, g, K, ..) at the one chosen side (2, g, K) a polygon."""
+    """Entries (2, g, ..) of `values` (2, g, K, ..) at the one chosen side (2, g, K) a
+    polygon.
+    """
     chosen = is_chosen.reshape(*is_chosen.shape, *[1] * (values.ndim - 3))
     return jnp.sum(jnp.where(chosen, values, 0.0), axis=2)
 
 
 def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
-    """Sides of polygons a, b (g, K, 2) that face each other, and unit normals from a to b.
+    """Sides of polygons a, b (g, K, 2) that face each other, and unit normals from a to
+    b.
 
-    One is the side whose line separates the two polygons most: over all sides of both, the least
-    height of the other polygon's corners over the line is largest. The other one is the side of the
-    other polygon whose normal is most opposite.
+    One is the side whose line separates the two polygons most: over all sides of both,
+    the least height of the other polygon's corners over the line is largest. The other
+    one is the side of the other polygon whose normal is most opposite.
     """
     both = jnp.stack([a, b])
     _, normals = sides(both)
@@ -134,28 +161,34 @@ def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
     beyond = _without_points(jnp.min(heights, axis=2), normals)
     own = jnp.argmax(beyond, axis=2)
     n = _at_side(jax.nn.one_hot(own, a.shape[1], dtype=bool), normals)
-    opposite = jnp.argmin(dot(normals[::-1], n[:, :, None]), axis=2)  # side of the other polygon
+    # side of the other polygon
+    opposite = jnp.argmin(dot(normals[::-1], n[:, :, None]), axis=2)
     separation = jnp.max(beyond, axis=2)
     by_b = separation[1] > separation[0] + PARALLEL  # a side of b separates more
-    first, second = jnp.where(by_b, opposite[1], own[0]), jnp.where(by_b, own[1], opposite[0])
+    first = jnp.where(by_b, opposite[1], own[0])
+    second = jnp.where(by_b, own[1], opposite[0])
     return Facing(first, second, jnp.where(by_b[:, None], -n[1], n[0]))
 
 
 def polygon_on_polygon(
     a: jax.Array, b: jax.Array, facing: Facing, swapped: jax.Array
 ) -> ContactPoints:
-    """Two contacts (g, 2) a pair of polygons (g, K, 2), at both ends of the facing sides.
+    """Two contacts (g, 2) a pair of polygons (g, K, 2), at both ends of the facing
+    sides.
 
-    At each end the gap is the lesser of two distances: of the end of the first side from the second
-    side, and of the opposite end of the second side from the first side. So it has no jumps. The
-    contact at the end of the first side comes first where `swapped` (g,), else that at its begin.
+    At each end the gap is the lesser of two distances: of the end of the first side
+    from the second side, and of the opposite end of the second side from the first
+    side. So it has no jumps. The contact at the end of the first side comes first where
+    `swapped` (g,), else that at its begin.
     """
     corners = jnp.stack([a, b])
     is_facing = jax.nn.one_hot(jnp.stack(facing[:2]), a.shape[1], dtype=bool)
     ends = jnp.stack([corners, jnp.roll(corners, -1, axis=2)], axis=3)
     ends = _at_side(is_facing, ends)  # (body, pair, begin or end, x or y)
-    begin, side = ends[:, :, 0], ends[:, :, 1] - ends[:, :, 0]
-    # the ends of each body's side in the order of the contacts, against the other body's side
+    begin = ends[:, :, 0]
+    side = ends[:, :, 1] - ends[:, :, 0]
+    # the ends of each body's side in the order of the contacts, against the other
+    # body's side
     reverse = jnp.stack([swapped, ~swapped])[:, :, None, None]
     ends = jnp.where(reverse, ends[:, :, ::-1], ends)
     others = (x[::-1, :, None] for x in (begin, side, outward(side)))
@@ -175,13 +208,14 @@ def changed_places(
     counts: tuple[np.ndarray, np.ndarray],
     facing: Facing,
 ) -> jax.Array:
-    """True (g,) for pairs whose contact at the end of the first side counts as the first contact.
+    """True (g,) for pairs whose contact at the end of the first side counts as the
+    first contact.
 
-    Where a body rolls over a corner, one of the facing sides gives way to its neighbour, which has
-    the corner at its other end. The contact there keeps its place among the two because they are
-    swapped where the numbers of both sides have an odd sum. Numbers of an odd polygon count on
-    through full turns, of the body and of the direction between the bodies, whose angle jumps by
-    2 pi at `_CUT`.
+    Where a body rolls over a corner, one of the facing sides gives way to its
+    neighbour, which has the corner at its other end. The contact there keeps its place
+    among the two because they are swapped where the numbers of both sides have an odd
+    sum. Numbers of an odd polygon count on through full turns, of the body and of the
+    direction between the bodies, whose angle jumps by 2 pi at `_CUT`.
 
     Args:
         polygons: corners (g, K, 2) of the first and of the second ones.
@@ -205,50 +239,73 @@ def changed_places(
 def _full_turns(
     corners: jax.Array, side: jax.Array, angle: jax.Array, direction: jax.Array
 ) -> jax.Array:
-    """Full turns (g,) between the `direction` (g,) [rad] to the other body and a facing side.
+    """Full turns (g,) between the `direction` (g,) [rad] to the other body and a facing
+    side.
 
-    Equation: `round((direction - phi) / 2 pi)`, phi the angle of the normal of `side` (g,), counted
-    on from the body's `angle` (g,) [rad], which has no jumps: from there to the normal of side 0,
-    and on to that of `side`, each by less than a turn. `corners` (g, K, 2) [m].
+    Equation: `round((direction - phi) / 2 pi)`, phi the angle of the normal of `side`
+    (g,), counted on from the body's `angle` (g,) [rad], which has no jumps: from there
+    to the normal of side 0, and on to that of `side`, each by less than a turn.
+    `corners` (g, K, 2) [m].
     """
     normal = sides(corners)[1]
     angles = jnp.arctan2(normal[..., 1], normal[..., 0])  # (g, K)
-    first, facing = angles[:, 0], angles[np.arange(len(angles)), side]
+    first = angles[:, 0]
+    facing = angles[np.arange(len(angles)), side]
     phi = angle + (first - angle) % (2 * np.pi) + (facing - first) % (2 * np.pi)
     return jnp.round((direction - phi) / (2 * np.pi)).astype(jnp.int32)
 
 
-def margin_of_places(polygons: tuple[jax.Array, jax.Array], facing: Facing) -> jax.Array:
-    """Margins (g,) that are >= 0 while contacts of an odd and an even polygon keep their order.
+def margin_of_places(
+    polygons: tuple[jax.Array, jax.Array], facing: Facing
+) -> jax.Array:
+    """Margins (g,) that are >= 0 while contacts of an odd and an even polygon keep
+    their order.
 
-    Equation: `max(1 - cos(angle between n and _CUT) - _NEAR_CUT, distance along n - _TOUCHING)`:
-    polygons in touch must not have their normal n at `_CUT`, see `changed_places`.
+    Equation: `max(1 - cos(angle between n and _CUT) - _NEAR_CUT, distance along n -
+    _TOUCHING)`: polygons in touch must not have their normal n at `_CUT`, see
+    `changed_places`.
     """
-    (a, b), n = polygons, facing.normal[:, None]
+    a, b = polygons
+    n = facing.normal[:, None]
     distance = jnp.min(dot(b, n), axis=1) - jnp.max(dot(a, n), axis=1)
-    off = 1 - dot(n[:, 0], jnp.array([[np.cos(_CUT), np.sin(_CUT)]], n.dtype)) - _NEAR_CUT
+    off = (
+        1 - dot(n[:, 0], jnp.array([[np.cos(_CUT), np.sin(_CUT)]], n.dtype)) - _NEAR_CUT
+    )
     return jnp.maximum(off, distance - _TOUCHING)
 
 
 def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactPoints:
-    """Two contacts (g, 2) of each pair of discs and polygons; with a disc the second one is open.
+    """Two contacts (g, 2) of each pair of discs and polygons; with a disc the second
+    one is open.
 
     a, b (g, K, 2) are corners, or the middle of a disc, r, s (g,) radii, 0 of polygons.
     """
-    # each pair is taken for two discs, two polygons, and a disc on a polygon: one of these counts
+    # each pair is taken for two discs, two polygons, and a disc on a polygon: one of
+    # these counts
     discs = round_on_round(a[:, 0], b[:, 0], r, s)
     polygons = polygon_on_polygon(a, b, facing_sides(a, b), jnp.zeros(len(a), bool))
     first_is_disc = r[:, None] > 0
     disc = jnp.where(first_is_disc, a[:, 0], b[:, 0])
-    mixed = disc_on_polygon(disc, jnp.maximum(r, s), jnp.where(first_is_disc[..., None], b, a))
+    mixed = disc_on_polygon(
+        disc, jnp.maximum(r, s), jnp.where(first_is_disc[..., None], b, a)
+    )
     mixed = mixed._replace(normal=jnp.where(first_is_disc, 1.0, -1.0) * mixed.normal)
-    any_disc, both_discs = (r > 0) | (s > 0), (r > 0) & (s > 0)
+    any_disc = (r > 0) | (s > 0)
+    both_discs = (r > 0) & (s > 0)
 
-    def chosen(of_discs: jax.Array, of_mixed: jax.Array, of_polygons: jax.Array) -> jax.Array:
-        """Values (g, 2, ..) by the kind of each pair; those of a disc, (g, ..), are repeated."""
+    def chosen(
+        of_discs: jax.Array, of_mixed: jax.Array, of_polygons: jax.Array
+    ) -> jax.Array:
+        """Values (g, 2, ..) by the kind of each pair; those of a disc, (g, ..), are
+        repeated.
+        """
         each = [1] * (of_discs.ndim - 1)
-        with_disc = jnp.where(both_discs.reshape(-1, *each), of_discs, of_mixed)[:, None]
+        with_disc = jnp.where(both_discs.reshape(-1, *each), of_discs, of_mixed)[
+            :, None
+        ]
         return jnp.where(any_disc.reshape(-1, 1, *each), with_disc, of_polygons)
 
     gap, point, normal = (chosen(*x) for x in zip(discs, mixed, polygons))
-    return ContactPoints(gap.at[:, 1].add(jnp.where(any_disc, jnp.inf, 0.0)), point, normal)
+    return ContactPoints(
+        gap.at[:, 1].add(jnp.where(any_disc, jnp.inf, 0.0)), point, normal
+    )

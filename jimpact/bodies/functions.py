@@ -13,12 +13,14 @@ from jimpact.tools.compiling import full_precision
 
 
 class FunctionBody(Body):
-    """A body given by functions of its configuration q (n,), see `System` and `scene_from_gaps`.
+    """A body given by functions of its configuration q (n,), see `System` and
+    `scene_from_gaps`.
 
     Args:
         gap_function: q -> gaps f(q) (m,) [m].
         mass: M (n,), its diagonal, or (n, n), or a function q -> M(q).
-        tangent_function: q -> displacements (m,) [m] along the contact planes; None: no friction.
+        tangent_function: q -> displacements (m,) [m] along the contact planes; None: no
+            friction.
     """
 
     gaps: Callable[[jax.Array], jax.Array]
@@ -26,15 +28,25 @@ class FunctionBody(Body):
     sliding: Callable[[jax.Array], jax.Array | None] | None
 
     def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
-        """Keep the functions; raise a TypeError for what is no function, check a constant mass."""
+        """Keep the functions; raise a TypeError for what is no function, check a
+        constant mass.
+        """
         for name, function in (
             ("gap_function", gap_function),
             ("tangent_function", tangent_function),
         ):
-            if not (callable(function) or (function is None and name != "gap_function")):
-                kinds = "a body or a function" if name == "gap_function" else "a function"
-                raise TypeError(f"Argument `{name}` must be {kinds}, but is {function!r}.")
-        self.gaps, self.sliding = gap_function, tangent_function
+            if not (
+                callable(function) or (function is None and name != "gap_function")
+            ):
+                if name == "gap_function":
+                    kinds = "a body or a function"
+                else:
+                    kinds = "a function"
+                raise TypeError(
+                    f"Argument `{name}` must be {kinds}, but is {function!r}."
+                )
+        self.gaps = gap_function
+        self.sliding = tangent_function
         if callable(mass):
             self.mass_argument = mass
         else:
@@ -57,8 +69,13 @@ class FunctionBody(Body):
 
     def tangent_function(self, q: jax.Array) -> jax.Array | None:
         """Displacements (m,) [m] along the contact planes."""
-        displacements = None if self.sliding is None else self.sliding(q)
-        return None if displacements is None else jnp.atleast_1d(displacements)
+        if self.sliding is None:
+            displacements = None
+        else:
+            displacements = self.sliding(q)
+        if displacements is None:
+            return None
+        return jnp.atleast_1d(displacements)
 
     def _parts(self, q: jax.Array) -> Parts:
         """Mass, normals, tangents and gaps at q, not compiled."""
@@ -72,7 +89,7 @@ def scene_from_gaps(
     q: Any,
     closed_below: float = CLOSED_BELOW,
 ) -> Scene:
-    """Scene of bodies at configuration `q`; the normals are the gradients of their gaps.
+    """Scene of bodies at `q`; the normals are the gradients of their gaps.
 
     Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
 

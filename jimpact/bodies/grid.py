@@ -1,4 +1,6 @@
-"""The closed contacts of many bodies, found among the pairs that a grid of cells says are near."""
+"""The closed contacts of many bodies, found among the pairs that a grid of cells says
+are near.
+"""
 
 from typing import NamedTuple, Protocol
 
@@ -20,20 +22,22 @@ from jimpact.bodies.shapes import inner_radii
 from jimpact.tools.checks import is_traced
 from jimpact.tools.compiling import full_precision
 
-# Pairs of each body whose circles around them meet, of polygons. Ten times more takes ten times the
-# memory.
+# Pairs of each body whose circles around them meet, of polygons. Ten times more takes
+# ten times the memory.
 NEAR = 8
 
-# Way of a body within half a step, over the least radius, up to which the grid finds all contacts:
-# what moves farther in a step than the least radius is a `coarse_step`. Ten times more makes cells
-# hold twenty times more bodies.
+# Way of a body within half a step, over the least radius, up to which the grid finds
+# all contacts: what moves farther in a step than the least radius is a `coarse_step`.
+# Ten times more makes cells hold twenty times more bodies.
 MARGIN = 0.5
 
 _Arrays = tuple[jax.Array, ...]
 
 
 class Pile(Protocol):
-    """Members of `Bodies` (see there and `RigidBodies`) that the grid uses: b bodies, w planes."""
+    """Members of `Bodies` (see there and `RigidBodies`) that the grid uses: b bodies, w
+    planes.
+    """
 
     @property
     def points(self) -> jax.Array:
@@ -57,7 +61,9 @@ class Pile(Protocol):
 
     @property
     def crowd(self) -> int:
-        """Most bodies in a row of three cells, see `near_pairs`; 0: every pair is looked at."""
+        """Most bodies in a row of three cells, see `near_pairs`; 0: every pair is
+        looked at.
+        """
 
     @property
     def count(self) -> int:
@@ -80,22 +86,29 @@ class Pile(Protocol):
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
         """The same of bodies at coordinates (b, ..), with these points (b, P, d)."""
 
-    def contact_jacobian(self, at: jax.Array, point: jax.Array, directions: jax.Array) -> jax.Array:
+    def contact_jacobian(
+        self, at: jax.Array, point: jax.Array, directions: jax.Array
+    ) -> jax.Array:
         """Velocities of points along directions, by the velocities of their bodies."""
 
 
 def slots(bodies: Pile) -> int:
-    """Contacts of a pair of bodies: 1 of discs or spheres; 2 of polygons, the ends of a side."""
+    """Contacts of a pair of bodies: 1 of discs or spheres; 2 of polygons, the ends of a
+    side.
+    """
     return min(2, bodies.points.shape[1])
 
 
 def stride(bodies: Pile) -> int:
-    """Partners b + w P of a body, by which contacts are numbered: bodies, then planes x points."""
+    """Partners b + w P of a body, by which contacts are numbered: bodies, then planes x
+    points.
+    """
     return bodies.count + len(bodies.planes) * bodies.points.shape[1]
 
 
 def outer_radii(bodies: Pile) -> jax.Array:
-    """Radii (b,) [m] of discs or balls about the centres of mass that enclose the bodies.
+    """Radii (b,) [m] of discs or balls about the centres of mass that enclose the
+    bodies.
 
     Equation: `R = max |c| + r`, c the points of a body, r its rim.
     """
@@ -104,10 +117,11 @@ def outer_radii(bodies: Pile) -> jax.Array:
 
 
 def least_radius(bodies: Pile) -> jax.Array:
-    """The least radius () [m] of a disc or ball about a centre of mass, within its body.
+    """The least radius () [m] of a disc or ball about a centre of mass, within its
+    body.
 
-    Equation: `r - |c|` of a round body of radius r about its point c, of a polygon the distance of
-    its nearest side.
+    Equation: `r - |c|` of a round body of radius r about its point c, of a polygon the
+    distance of its nearest side.
     """
     far = jnp.sqrt(jnp.sum(bodies.points[:, 0] ** 2, axis=1))
     if slots(bodies) == 1:
@@ -117,18 +131,27 @@ def least_radius(bodies: Pile) -> jax.Array:
 
 
 def crowd_of_cells(bodies: Pile) -> int:
-    """Most bodies in a row of three cells; 0: radii are traced, or all pairs are less work."""
+    """Most bodies in a row of three cells; 0: radii are traced, or all pairs are less
+    work.
+    """
     if is_traced((bodies.points, bodies.rims)):
         return 0
-    least, largest = float(least_radius(bodies)), float(outer_radii(bodies).max())
+    least = float(least_radius(bodies))
+    largest = float(outer_radii(bodies).max())
     crowd = crowd_of(least, largest + 0.5 * MARGIN * least, bodies.dimension)
-    rows = (3 ** (bodies.dimension - 1) + 1) // 2  # of cells in which a body looks for partners
-    return crowd if 2 * rows * crowd < bodies.count else 0
+    # of cells in which a body looks for partners
+    rows = (3 ** (bodies.dimension - 1) + 1) // 2
+    if 2 * rows * crowd < bodies.count:
+        return crowd
+    return 0
 
 
 def _circle_gaps(bodies: Pile, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
-    """Gaps `|x_i - x_j| - R_i - R_j` (C,) [m] of the discs or balls around bodies i, j (C,)."""
-    columns = bodies.of_bodies(q)[:, : bodies.dimension].T  # one by one: five times faster
+    """Gaps `|x_i - x_j| - R_i - R_j` (C,) [m] of the discs or balls around bodies i, j
+    (C,).
+    """
+    # one by one: five times faster
+    columns = bodies.of_bodies(q)[:, : bodies.dimension].T
     squares = sum((x[i] - x[j]) ** 2 for x in columns)
     radii = outer_radii(bodies)
     return jnp.sqrt(squares) - radii[i] - radii[j]
@@ -136,8 +159,11 @@ def _circle_gaps(bodies: Pile, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.
 
 @full_precision
 def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
-    """Gaps `n . x - c - r` (b, w, P) [m] of all points x with all planes; infinite of padding."""
-    n, offset = bodies.planes[:, :-1], bodies.planes[:, -1]
+    """Gaps `n . x - c - r` (b, w, P) [m] of all points x with all planes; infinite of
+    padding.
+    """
+    n = bodies.planes[:, :-1]
+    offset = bodies.planes[:, -1]
     height = jnp.sum(bodies.placed(q).points[:, None] * n[None, :, None], axis=3)
     gap = height - offset[None, :, None] - bodies.rims[:, None, None]
     sizes = np.array([shape.size for shape in bodies.shapes])
@@ -146,20 +172,28 @@ def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
 
 
 def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
-    """Candidates for contact: all pairs of bodies with gaps up to `margin` [m] at q, and others."""
+    """Candidates for contact: all pairs of bodies with gaps up to `margin` [m] at q,
+    and others.
+    """
     if bodies.crowd == 0:
         return all_pairs(bodies.count)
     distance = 2 * jnp.max(outer_radii(bodies)) + margin
-    return near_pairs(bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd)
+    return near_pairs(
+        bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd
+    )
 
 
-def _pair_contacts(bodies: Pile, at: jax.Array, i: jax.Array, j: jax.Array) -> ContactPoints:
-    """Contacts of bodies i and j (g,), k = `slots` a pair: gaps (g, k), points (g, k, d), normals.
+def _pair_contacts(
+    bodies: Pile, at: jax.Array, i: jax.Array, j: jax.Array
+) -> ContactPoints:
+    """Contacts of bodies i and j (g,), k = `slots` a pair: gaps (g, k), points (g, k,
+    d), normals.
 
     `at` (b, ..) are the coordinates of all bodies; normals are towards body i.
     """
     a, b = (bodies.placed_at(at[x], bodies.points[x]).points for x in (i, j))
-    r, s = bodies.rims[i], bodies.rims[j]
+    r = bodies.rims[i]
+    s = bodies.rims[j]
     if slots(bodies) > 1:
         return any_pair(a, b, r, s)
     return ContactPoints(*(x[:, None] for x in round_on_round(a[:, 0], b[:, 0], r, s)))
@@ -168,15 +202,17 @@ def _pair_contacts(bodies: Pile, at: jax.Array, i: jax.Array, j: jax.Array) -> C
 def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
     """The least gap () [m] of all contacts at q.
 
-    If bodies near each other, or planes, have one up to `MARGIN` of the least radius, no other pair
-    can have less; else all pairs are tested.
+    If bodies near each other, or planes, have one up to `MARGIN` of the least radius,
+    no other pair can have less; else all pairs are tested.
     """
     others = jnp.asarray(np.arange(bodies.count, dtype=np.int32))
     to_planes = jnp.min(_plane_gaps(bodies, q), initial=jnp.inf)
     at = bodies.of_bodies(q)
 
     def of_all_pairs() -> jax.Array:
-        """The least gap () of all pairs and planes, body by body: no table holds all pairs."""
+        """The least gap () of all pairs and planes, body by body: no table holds all
+        pairs.
+        """
 
         def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
             """The least gap () with those of body i and every other one."""
@@ -184,18 +220,24 @@ def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
             itself = (others == i)[:, None]
             return jnp.minimum(least, jnp.min(jnp.where(itself, jnp.inf, gaps)))
 
-        return jax.lax.fori_loop(jnp.int32(0), jnp.int32(bodies.count), with_one, to_planes)
+        return jax.lax.fori_loop(
+            jnp.int32(0), jnp.int32(bodies.count), with_one, to_planes
+        )
 
     if bodies.crowd == 0:
         return of_all_pairs()
     margin = MARGIN * least_radius(bodies)
     near = _near_gaps(bodies, q, q, margin)
     least = jnp.minimum(jnp.min(near.gaps, initial=jnp.inf), to_planes)
-    return jax.lax.cond((least <= margin) & ~near.overflows, lambda: least, of_all_pairs)
+    return jax.lax.cond(
+        (least <= margin) & ~near.overflows, lambda: least, of_all_pairs
+    )
 
 
 class _NearGaps(NamedTuple):
-    """Pairs of bodies that may be in contact, and their least gaps at one of two configurations."""
+    """Pairs of bodies that may be in contact, and their least gaps at one of two
+    configurations.
+    """
 
     first: jax.Array  # (C,) body i
     second: jax.Array  # (C,) body j
@@ -203,21 +245,28 @@ class _NearGaps(NamedTuple):
     overflows: jax.Array  # () whether pairs are missing
 
 
-def _near_gaps(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -> _NearGaps:
-    """All pairs of bodies with gaps up to `below` () [m] at q or at `later`, and others.
+def _near_gaps(
+    bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
+) -> _NearGaps:
+    """All pairs of bodies with gaps up to `below` () [m] at q or at `later`, and
+    others.
 
-    Pairs from the grid are tested by the discs or balls around them; those of polygons that pass
-    get the gaps of their sides, the least one at q and at `later`.
+    Pairs from the grid are tested by the discs or balls around them; those of polygons
+    that pass get the gaps of their sides, the least one at q and at `later`.
     """
     displacement = jnp.abs(bodies.of_bodies(later - q)[:, : bodies.dimension])
-    # two bodies move by half of theirs from (q + later) / 2; larger ones are a `coarse_step`
-    farther = jnp.minimum(jnp.max(jnp.sum(displacement, axis=1)), MARGIN * least_radius(bodies))
+    # two bodies move by half of theirs from (q + later) / 2; larger ones are a
+    # `coarse_step`
+    farther = jnp.minimum(
+        jnp.max(jnp.sum(displacement, axis=1)), MARGIN * least_radius(bodies)
+    )
     near = _candidates(bodies, 0.5 * (q + later), below + farther)
     circles = [_circle_gaps(bodies, x, near.first, near.second) for x in (q, later)]
     gaps = jnp.where(near.used, jnp.minimum(*circles), jnp.inf)
     if all(shape.centred for shape in bodies.shapes):
         return _NearGaps(near.first, near.second, gaps[:, None], near.overflows)
-    so_far = jnp.cumsum(gaps <= below, dtype=jnp.int32)  # pairs among the candidates 0 to c
+    # pairs among the candidates 0 to c
+    so_far = jnp.cumsum(gaps <= below, dtype=jnp.int32)
     rows = -(-NEAR * bodies.count // BLOCK) * BLOCK  # rounded up to whole blocks
     count = jnp.minimum(so_far[-1], rows)
     at = jnp.stack([bodies.of_bodies(x) for x in (q, later)])  # (2, b, ..)
@@ -239,14 +288,20 @@ def _near_gaps(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -
 def _closed(
     bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Numbers (C,) of contacts, True (C,) for those that are closed, and whether some are missing.
+    """Numbers (C,) of contacts, True (C,) for those that are closed, and whether some
+    are missing.
 
-    A contact is closed whose gap is at most `below` () [m] at q or `later`. Its number is
-    `slots (i stride + partner) + slot`, partner j of body i, or b + corner of each plane in turn.
+    A contact is closed whose gap is at most `below` () [m] at q or `later`. Its number
+    is
+    `slots (i stride + partner) + slot`, partner j of body i, or b + corner of each
+    plane in turn.
     """
     near = _near_gaps(bodies, q, later, below)
-    to_planes = jnp.minimum(_plane_gaps(bodies, q), _plane_gaps(bodies, later)).reshape(-1)
-    count, partners = slots(bodies), stride(bodies)
+    to_planes = jnp.minimum(_plane_gaps(bodies, q), _plane_gaps(bodies, later)).reshape(
+        -1
+    )
+    count = slots(bodies)
+    partners = stride(bodies)
     slot = np.arange(count, dtype=np.int32)[None]
     of_pairs = count * (near.first * partners + near.second)[:, None] + slot
     partner = np.arange(bodies.count, partners, dtype=np.int32)
@@ -257,23 +312,29 @@ def _closed(
     return numbers, closed, near.overflows
 
 
-def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
-    """The contacts with a gap up to `below` () [m] at coordinates q, or `later` at a step's end.
+def active_pairs(
+    bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
+) -> ActivePairs:
+    """The contacts with a gap up to `below` () [m] at coordinates q, or `later` at a
+    step's end.
 
-    Of all candidates the closed ones get the rows 0, 1, .. of arrays of fixed length, `bodies.room`
-    rounded up to blocks, in the order of their numbers. Rows that are not used are 0, and have the
-    number `no_contact`. It overflows where there are more than `bodies.room`, or the grid has no
-    room for all pairs that are near.
+    Of all candidates the closed ones get the rows 0, 1, .. of arrays of fixed length,
+    `bodies.room` rounded up to blocks, in the order of their numbers. Rows that are not
+    used are 0, and have the number `no_contact`. It overflows where there are more than
+    `bodies.room`, or the grid has no room for all pairs that are near.
     """
     numbers, closed, overflows = _closed(bodies, q, later, below)
     rows = -(-bodies.room // BLOCK) * BLOCK
     closed_up_to = jnp.cumsum(closed, dtype=jnp.int32)  # among the first k candidates
     count = jnp.minimum(closed_up_to[-1], rows)
     d = bodies.dimension
-    no_contact = jnp.int32(slots(bodies) * bodies.count * stride(bodies))  # above all numbers
+    # above all numbers
+    no_contact = jnp.int32(slots(bodies) * bodies.count * stride(bodies))
 
     def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
-        """The numbers, bodies and directions with the rows of the block from row `first` on."""
+        """The numbers, bodies and directions with the rows of the block from row
+        `first` on.
+        """
         used, chosen = chosen_rows(closed_up_to, first, count)
         chosen = jnp.where(used, numbers[chosen], 0)
         i, j, directions = _of_contacts(bodies, q, chosen)
@@ -304,16 +365,20 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
 def _of_contacts(
     bodies: Pile, q: jax.Array, number: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Bodies i and j (K,) of the contacts of these numbers (K,), and their directions, at q.
+    """Bodies i and j (K,) of the contacts of these numbers (K,), and their directions,
+    at q.
 
-    j is the number of bodies for a plane; directions (K, d, 2, velocities) as of `ActivePairs`.
+    j is the number of bodies for a plane; directions (K, d, 2, velocities) as of
+    `ActivePairs`.
     """
     pair, slot = jnp.divmod(number, jnp.int32(slots(bodies)))
     i, partner = jnp.divmod(pair, jnp.int32(stride(bodies)))  # see `_closed`
-    other, row = jnp.minimum(partner, bodies.count - 1), np.arange(len(number))
+    other = jnp.minimum(partner, bodies.count - 1)
+    row = np.arange(len(number))
     at = bodies.of_bodies(q)
     _, points, normals = _pair_contacts(bodies, at, i, other)
-    point, n = points[row, slot], normals[row, slot]
+    point = points[row, slot]
+    n = normals[row, slot]
     if len(bodies.planes):
         on_plane = (partner >= bodies.count)[:, None]
         plane, corner = jnp.divmod(

@@ -7,17 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Cells along each axis, about the middle of the points: their numbers fit in 32 bits. Points beyond
-# count as in the last cell, so ten times fewer are too few for what flies apart.
+# Cells along each axis, about the middle of the points: their numbers fit in 32 bits.
+# Points beyond count as in the last cell, so ten times fewer are too few for what flies
+# apart.
 _CELLS = {2: 40_000, 3: 1_200}
 
-# Part by which a cell is longer than the distance, so that rounding of its number misses no pair.
-# Ten times more only makes cells larger.
+# Part by which a cell is longer than the distance, so that rounding of its number
+# misses no pair. Ten times more only makes cells larger.
 _SLACK = 1e-6
 
 
 class Candidates(NamedTuple):
-    """Pairs of points that may be near each other: each pair of near ones once, and others."""
+    """Pairs of points that may be near each other: each pair of near ones once, and
+    others.
+    """
 
     first: jax.Array  # (C,) of points, the smaller number
     second: jax.Array  # (C,)
@@ -32,13 +35,15 @@ def all_pairs(count: int) -> Candidates:
 
 
 def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates:
-    """Pairs of points (k, d) [m], d = 2 or 3: all nearer than `distance` () [m], and others.
+    """Pairs of points (k, d) [m], d = 2 or 3: all nearer than `distance` () [m], and
+    others.
 
-    Space is divided into square or cubic cells of this length, and the points are sorted by the
-    numbers of their cells, which are consecutive along the last axis. Each point is paired with the
-    points after it in its own row of three cells (the cell before, its own, the next one along the
-    last axis), and with those of half of the rows around: the other half pairs with it. A row may
-    hold `crowd` points, else the result `overflows`.
+    Space is divided into square or cubic cells of this length, and the points are
+    sorted by the numbers of their cells, which are consecutive along the last axis.
+    Each point is paired with the points after it in its own row of three cells (the
+    cell before, its own, the next one along the last axis), and with those of half of
+    the rows around: the other half pairs with it. A row may hold `crowd` points, else
+    the result `overflows`.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 7.1.
     """
@@ -48,11 +53,14 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
     cell = jnp.floor((points - middle[None]) / side)
     half = _CELLS[d] // 2
     cell = jnp.clip(cell, -half, half).astype(jnp.int32)
-    cell = cell - jnp.min(cell, axis=0, keepdims=True) + 1  # room for a neighbour on both sides
+    # room for a neighbour on both sides
+    cell = cell - jnp.min(cell, axis=0, keepdims=True) + 1
     lengths = jnp.max(cell, axis=0) + 2  # number of cells along each axis
 
     def number(indices: jax.Array) -> jax.Array:
-        """Numbers (k,) of cells with indices (k, d): `(i_1 L_2 + i_2) L_3 + i_3`, L = lengths."""
+        """Numbers (k,) of cells with indices (k, d): `(i_1 L_2 + i_2) L_3 + i_3`, L =
+        lengths.
+        """
         result = indices[:, 0]
         for axis in range(1, d):
             result = result * lengths[axis] + indices[:, axis]
@@ -62,20 +70,32 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
     order = jnp.argsort(own).astype(jnp.int32)
     numbers = own[order]
     # place of each point in this order
-    place = jnp.zeros(count, jnp.int32).at[order].set(jnp.arange(count, dtype=jnp.int32))
-    begin, end = [], []
+    place = (
+        jnp.zeros(count, jnp.int32).at[order].set(jnp.arange(count, dtype=jnp.int32))
+    )
+    begin = []
+    end = []
     for row in itertools.product((-1, 0, 1), repeat=d - 1):
         if row < (0,) * (d - 1):
             continue  # points of these rows are paired with those of this one
-        low, high = (number(cell + np.array([[*row, last]], np.int32)) for last in (-1, 1))
+        low, high = (
+            number(cell + np.array([[*row, last]], np.int32)) for last in (-1, 1)
+        )
         own_row = not any(row)
-        begin.append(place + 1 if own_row else jnp.searchsorted(numbers, low, side="left"))
+        begin.append(
+            place + 1 if own_row else jnp.searchsorted(numbers, low, side="left")
+        )
         end.append(jnp.searchsorted(numbers, high, side="right"))
-    starts, ends = jnp.stack(begin, axis=1), jnp.stack(end, axis=1)  # (k, rows)
-    at = starts[:, :, None] + np.arange(crowd, dtype=np.int32)[None, None]  # (k, rows, crowd)
+    # (k, rows)
+    starts = jnp.stack(begin, axis=1)
+    ends = jnp.stack(end, axis=1)
+    # (k, rows, crowd)
+    at = starts[:, :, None] + np.arange(crowd, dtype=np.int32)[None, None]
     used = at < ends[:, :, None]
     other = order[jnp.minimum(at, count - 1)]
-    point = jnp.broadcast_to(np.arange(count, dtype=np.int32)[:, None, None], other.shape)
+    point = jnp.broadcast_to(
+        np.arange(count, dtype=np.int32)[:, None, None], other.shape
+    )
     return Candidates(
         jnp.minimum(point, other).reshape(-1),
         jnp.maximum(point, other).reshape(-1),
@@ -85,12 +105,14 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
 
 
 def crowd_of(least: float, largest: float, d: int) -> int:
-    """Most discs (d = 2) or balls that have centres in a row of three cells and do not overlap.
+    """Most discs (d = 2) or balls that have centres in a row of three cells and do not
+    overlap.
 
-    Equation: with radii from `least` to `largest` [m], s = 2 `least` and cells of length
-    a = 2 `largest`, `N = D (3 a + s) (a + s)^(d - 1) / V + 1`, V the volume of a ball of diameter
-    s, D = .9069 (d = 2) and .7405 the share of the densest packing; one more for bodies that
-    overlap a little.
+    Equation: with radii from `least` to `largest` [m], s = 2 `least` and cells of
+    length
+    a = 2 `largest`, `N = D (3 a + s) (a + s)^(d - 1) / V + 1`, V the volume of a ball
+    of diameter s, D = .9069 (d = 2) and .7405 the share of the densest packing; one
+    more for bodies that overlap a little.
     """
     ratio = largest / least
     density = {2: np.sqrt(4 / 3), 3: np.sqrt(2)}[d]  # D s^d / V

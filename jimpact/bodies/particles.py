@@ -22,14 +22,15 @@ from jimpact.tools.checks import is_traced
 class Corner(Body):
     """A particle between two walls that meet at the origin; q = (x, y).
 
-    Equation: `f_1 = y`, `f_2 = x sin(angle) - y cos(angle)`: wall 1 along +x, wall 2 along
-    (cos(angle), sin(angle)); tangents point away from the corner.
+    Equation: `f_1 = y`, `f_2 = x sin(angle) - y cos(angle)`: wall 1 along +x, wall 2
+    along (cos(angle), sin(angle)); tangents point away from the corner.
 
     Args:
         angle: between the walls, in (0, pi) [rad].
         mass: > 0 [kg].
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66): the kinetic angle is the angle.
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66): the kinetic angle is the
+    angle.
 
     >>> import jimpact as ji
     >>> ji.Corner(angle=1.0).gap_function(ji.Corner(angle=1.0).touching()).tolist()
@@ -41,10 +42,12 @@ class Corner(Body):
 
     def __init__(self, angle: Any, mass: Any = 1.0):
         """Check that the angle lies in (0, pi) and the mass is positive."""
-        self.angle, self.particle_mass = number("angle", angle), positive("mass", mass)
+        self.angle = number("angle", angle)
+        self.particle_mass = positive("mass", mass)
         if not is_traced(self.angle) and not 0 < float(self.angle) < np.pi:
             raise ValueError(
-                f"Argument `angle` must lie in (0, pi), but has value {float(self.angle):g}."
+                f"Argument `angle` must lie in (0, pi), but has value "
+                f"{float(self.angle):g}."
             )
 
     @property
@@ -59,15 +62,23 @@ class Corner(Body):
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = m g y`."""
-        return LinearPotential(self.mass * jnp.array([0.0, 1.0], self.mass.dtype) * acceleration)
+        return LinearPotential(
+            self.mass * jnp.array([0.0, 1.0], self.mass.dtype) * acceleration
+        )
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Distances f (2,) [m] from wall 1 and from wall 2, see the class."""
-        return jnp.stack([q[1], q[0] * jnp.sin(self.angle) - q[1] * jnp.cos(self.angle)])
+        return jnp.stack(
+            [q[1], q[0] * jnp.sin(self.angle) - q[1] * jnp.cos(self.angle)]
+        )
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Positions (2,) [m] along the walls: `x`, and `x cos(angle) + y sin(angle)`."""
-        return jnp.stack([q[0], q[0] * jnp.cos(self.angle) + q[1] * jnp.sin(self.angle)])
+        """Positions (2,) [m] along the walls: `x`, and
+        `x cos(angle) + y sin(angle)`.
+        """
+        return jnp.stack(
+            [q[0], q[0] * jnp.cos(self.angle) + q[1] * jnp.sin(self.angle)]
+        )
 
     def touching(self) -> jax.Array:
         """q (2,) in the corner."""
@@ -91,7 +102,8 @@ class Corner(Body):
 class Column(Body):
     """Balls above one another on a floor; q = their heights, ball 1 is the lowest.
 
-    Equation: `f_1 = q_1 - R_1`, `f_j = (q_j - R_j) - (q_{j-1} + R_{j-1})`; contact 1 is the floor.
+    Equation: `f_1 = q_1 - R_1`, `f_j = (q_j - R_j) - (q_{j-1} + R_{j-1})`; contact 1 is
+    the floor.
 
     Args:
         masses: (n,) > 0 [kg].
@@ -140,7 +152,10 @@ class Column(Body):
         return numbered(("height [m]",), self.masses.shape[0])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Circles (k, 2) [m] about heights q; a mass point has the radius `point` and lies on q."""
+        """Circles (k, 2) [m] about heights q; a mass point has the radius `point` and
+        lies on q.
+        """
         radii = np.asarray(self.radii)
-        shown, lift = np.where(radii > 0, radii, point), np.where(radii > 0, 0.0, point)
+        shown = np.where(radii > 0, radii, point)
+        lift = np.where(radii > 0, 0.0, point)
         return [r * CIRCLE + (0, y + d) for r, y, d in zip(shown, q, lift, strict=True)]

@@ -13,12 +13,14 @@ from jimpact.tools.compiling import full_precision
 
 
 class PendulumCradle(Body):
-    """Balls on parallel strings, side by side; q = the angles of the strings, to the right > 0.
+    """Balls on parallel strings, side by side; q = the angles of the strings.
 
-    Equation: ball i at `(s_i + l sin(q_i), -l cos(q_i))`, `f_j = |c_{j+1} - c_j| - R_j - R_{j+1}`,
-    `M = diag(m_i l^2)`: each ball hangs on two strings, so that it does not turn. The suspensions
-    s_i stand so far apart that the gaps at rest are `gaps`. At rest with closed gaps
-    `N = l N_chain`, so that W is that of `chain(masses)`, and gap velocities are `l` times those.
+    Equation: ball i at `(s_i + l sin(q_i), -l cos(q_i))`,
+    `f_j = |c_{j+1} - c_j| - R_j - R_{j+1}`, `M = diag(m_i l^2)`: each ball hangs on two
+    strings, so that it does not turn. The suspensions s_i stand so far apart that the
+    gaps at rest are `gaps`. At rest with closed gaps
+    `N = l N_chain`, so that W is that of `chain(masses)`, and gap velocities are `l`
+    times those.
 
     Args:
         masses: (n,) > 0 [kg], n >= 2.
@@ -44,11 +46,16 @@ class PendulumCradle(Body):
         self.masses = positives("masses", masses)
         n = self.masses.shape[0]
         if n < 2:
-            raise ValueError(f"Argument `masses` must hold two balls or more, but holds {n}.")
+            raise ValueError(
+                f"Argument `masses` must hold two balls or more, but holds {n}."
+            )
         self.length = positive("length", length)
         self.radius = positives("radius", radius, n)
         gaps = as_float_array("gaps", gaps)
-        self.gaps = jnp.full(n - 1, gaps) if gaps.ndim == 0 else gaps
+        if gaps.ndim == 0:
+            self.gaps = jnp.full(n - 1, gaps)
+        else:
+            self.gaps = gaps
         check_shape("gaps", self.gaps, (n - 1,), "one between each two balls")
         check_values("gaps", self.gaps, low=0.0)
 
@@ -76,13 +83,18 @@ class PendulumCradle(Body):
         return across / (jnp.sqrt(right**2 + up**2) + touching)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """The least gap () [m] between balls that are no neighbours: they have no contact."""
+        """The least gap () [m] between balls that are no neighbours: they have no
+        contact.
+        """
         i, j = np.triu_indices(self.masses.shape[0], 2)
         if not len(i):
             return super().valid(q)
         between = self.radius[:-1] + self.radius[1:] + self.gaps
-        suspensions = jnp.concatenate([jnp.zeros_like(between[:1]), jnp.cumsum(between)])
-        right, up = suspensions + self.length * jnp.sin(q), self.length * jnp.cos(q)
+        suspensions = jnp.concatenate(
+            [jnp.zeros_like(between[:1]), jnp.cumsum(between)]
+        )
+        right = suspensions + self.length * jnp.sin(q)
+        up = self.length * jnp.cos(q)
         apart = jnp.sqrt((right[i] - right[j]) ** 2 + (up[i] - up[j]) ** 2)
         return jnp.min(apart - self.radius[i] - self.radius[j])
 
@@ -101,9 +113,13 @@ class PendulumCradle(Body):
         return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """Curves (k, 2) [m] by body: the string and the circle of each ball at angles q (n,)."""
-        length, radius = float(self.length), np.asarray(self.radius)
-        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)  # distances of suspensions
+        """Curves (k, 2) [m] by body: the string and the circle of each ball at angles q
+        (n,).
+        """
+        length = float(self.length)
+        radius = np.asarray(self.radius)
+        # distances of suspensions
+        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
         curves = []
         for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
             pivot = np.array([x, 0.0])

@@ -23,22 +23,26 @@ from jimpact.bodies.base import (
 from jimpact.tools.checks import as_float_array, as_numbers, check_shape, is_traced
 from jimpact.tools.compiling import full_precision
 
-# How far a quaternion may be from length 1. Numbers written with six digits are within; ten times
-# more, and a motion could turn a body by a visible angle before it says so.
+# How far a quaternion may be from length 1. Numbers written with six digits are within;
+# ten times more, and a motion could turn a body by a visible angle before it says so.
 UNIT_WITHIN = 1e-6
-_SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
+# squares of angles below it go through the series: there the formula is 0/0
+_SERIES = 1e-2
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
 
-# Tangents in space begin with the direction nearest to this one. No axis: contacts with a normal
-# along it have no first tangent, and normals along axes are frequent.
+# Tangents in space begin with the direction nearest to this one. No axis: contacts with
+# a normal along it have no first tangent, and normals along axes are frequent.
 _ASIDE = (0.7, -0.6, 0.387)
 
-_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)  # of j and k, by i
-_EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edges of a box
+# of j and k, by i
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
+# a way along all edges of a box
+_EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]
 
 
 def _quaternion_product() -> np.ndarray:
-    """Table (4, 4, 4) of the product of quaternions: `(e f)_i = sum_jk table_ijk e_j f_k`.
+    """Table (4, 4, 4) of the product of quaternions:
+    `(e f)_i = sum_jk table_ijk e_j f_k`.
 
     The first entry of each is the scalar.
     """
@@ -53,7 +57,9 @@ _QUATERNION_PRODUCT = _quaternion_product()
 
 
 class ContactPoints(NamedTuple):
-    """Of m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
+    """Of m contacts: gap [m], where it is [m], and the unit normal from body 2 to body
+    1.
+    """
 
     gap: jax.Array  # (m,)
     point: jax.Array  # (m, 2 or 3)
@@ -63,7 +69,8 @@ class ContactPoints(NamedTuple):
 class Shape(NamedTuple):
     """Constants of a body that are part of a compiled program."""
 
-    order: tuple[int, ...]  # numbers of its points that make contact with planes, in order
+    # numbers of its points that make contact with planes, in order
+    order: tuple[int, ...]
     size: int  # number of its points
     faces: bool  # a polygon or a box, which others may touch anywhere
     centred: bool  # a disc or sphere that looks the same from all sides
@@ -75,31 +82,37 @@ class Shape(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Orientations R and points of b bodies in space: `x + R c` for each point c of a body."""
+    """Orientations R and points of b bodies in space: `x + R c` for each point c of a
+    body.
+    """
 
     turns: jax.Array  # R (b, d, d) from the axes of each body to those of space
     points: jax.Array  # (b, P, d) [m]
 
 
 class RigidBodies(Body):
-    """Rigid bodies in the plane or in space: points with a rim, mass and inertia of each.
+    """Rigid bodies in the plane or in space: points with a rim, mass and inertia of
+    each.
 
-    Equation: in the plane q holds (x, y, theta) of each body, x its centre of mass; in space
+    Equation: in the plane q holds (x, y, theta) of each body, x its centre of mass; in
+    space
     (x, y, z, e_0, e_1, e_2, e_3), e a unit quaternion, scalar first, and velocities are
     (x', omega), omega in the body's axes: `e' = e (0, omega) / 2`,
     `M v' = F - (0, omega x I omega)`; `moved` turns exactly and keeps the length of e.
     At a contact of bodies i and j in the point x, along a direction t,
-    `v_t = t . (x_i' + omega_i x (x - x_i)) - t . (x_j' + omega_j x (x - x_j))`; in the plane
-    tangents are the normal turned to the right, in space two at right angles.
-    Contact points are discs or spheres of radius r, the rim, about the points c of a body; on a
-    plane `n . x >= c_w` they have `f = n . (x + R c) - r - c_w`.
+    `v_t = t . (x_i' + omega_i x (x - x_i)) - t . (x_j' + omega_j x (x - x_j))`; in the
+    plane tangents are the normal turned to the right, in space two at right angles.
+    Contact points are discs or spheres of radius r, the rim, about the points c of a
+    body; on a plane `n . x >= c_w` they have `f = n . (x + R c) - r - c_w`.
 
     Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
     """
 
     masses: jax.Array  # (b,) [kg]
-    inertias: jax.Array  # (b, 1) in the plane, in space (b, 3), its diagonal, or (b, 3, 3)
-    # (b, P, d) from the centres of mass, of polygons counter-clockwise, the last one repeated
+    # (b, 1) in the plane, in space (b, 3), its diagonal, or (b, 3, 3)
+    inertias: jax.Array
+    # (b, P, d) from the centres of mass, of polygons counter-clockwise, the last one
+    # repeated
     points: jax.Array
     rims: jax.Array  # (b,) radii about the points
     planes: jax.Array  # (w, d + 1) unit normal, distance
@@ -109,7 +122,8 @@ class RigidBodies(Body):
         """Numbers of bodies, points and planes, without the arrays."""
         each = self.points.shape[1]
         return (
-            f"{type(self).__name__}({self.count} of up to {each} points, {len(self.planes)} planes)"
+            f"{type(self).__name__}({self.count} of up to {each} points, "
+            f"{len(self.planes)} planes)"
         )
 
     # ---- sizes
@@ -136,13 +150,19 @@ class RigidBodies(Body):
 
     @property
     def coordinates(self) -> int | None:
-        """Seven for each body in space, with six velocities; None: as many as velocities."""
-        return 7 * self.count if self.quaternions else None
+        """Seven for each body in space, with six velocities; None: as many as
+        velocities.
+        """
+        if self.quaternions:
+            return 7 * self.count
+        return None
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
         """The condition `valid(q) >= 0` in words, for errors."""
-        return "a quaternion of length 1 each" if self.quaternions else super().range_in_words
+        if self.quaternions:
+            return "a quaternion of length 1 each"
+        return super().range_in_words
 
     def of_bodies(self, q: jax.Array) -> jax.Array:
         """Coordinates or velocities (b, ..) of each body."""
@@ -153,9 +173,13 @@ class RigidBodies(Body):
         return self.of_bodies(q)
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers of body and of point (p,) of every point that makes contact with planes."""
+        """Numbers of body and of point (p,) of every point that makes contact with
+        planes.
+        """
         orders = [shape.order for shape in self.shapes[: self.count]]
-        return np.repeat(np.arange(len(orders)), [len(x) for x in orders]), np.concatenate(orders)
+        return np.repeat(
+            np.arange(len(orders)), [len(x) for x in orders]
+        ), np.concatenate(orders)
 
     def pairs_in_contact(self) -> np.ndarray:
         """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
@@ -176,16 +200,25 @@ class RigidBodies(Body):
         if self.inertias.ndim == 2:
             return jnp.concatenate([masses, self.inertias], axis=1).reshape(-1)
         each = zip(masses, self.inertias)
-        return jax.scipy.linalg.block_diag(*(block for m, i in each for block in (jnp.diag(m), i)))
+        return jax.scipy.linalg.block_diag(
+            *(block for m, i in each for block in (jnp.diag(m), i))
+        )
 
     @full_precision
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """Gyroscopic terms `-(0, omega x I omega)` of each body (n,) [N, N m]; 0 in the plane."""
+        """Gyroscopic terms `-(0, omega x I omega)` of each body (n,) [N, N m]; 0 in the
+        plane.
+        """
         if not self.quaternions:
             return jnp.zeros_like(v)
         omega = self.of_bodies(v)[:, 3:]
-        spin = self.inertias * omega if self.inertias.ndim == 2 else times(self.inertias, omega)
-        return jnp.concatenate([jnp.zeros_like(omega), -cross(omega, spin)], axis=1).reshape(-1)
+        if self.inertias.ndim == 2:
+            spin = self.inertias * omega
+        else:
+            spin = times(self.inertias, omega)
+        return jnp.concatenate(
+            [jnp.zeros_like(omega), -cross(omega, spin)], axis=1
+        ).reshape(-1)
 
     def valid(self, q: jax.Array) -> jax.Array:
         """Margin () of the quaternions' lengths: `UNIT_WITHIN - max | |e| - 1 |`."""
@@ -195,10 +228,11 @@ class RigidBodies(Body):
 
     @full_precision
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """q after the displacement u (n,): each body moved by u_x and turned by u_r, in its axes.
+        """q after the displacement u (n,): each body moved by u_x and turned by u_r, in
+        its axes.
 
-        Equation: `x + u_x`, and the quaternion `e (cos |h|, sin |h| h / |h|)`, `h = u_r / 2`, of
-        length 1.
+        Equation: `x + u_x`, and the quaternion `e (cos |h|, sin |h| h / |h|)`,
+        `h = u_r / 2`, of length 1.
         """
         if not self.quaternions:
             return q + u
@@ -208,11 +242,12 @@ class RigidBodies(Body):
 
     @full_precision
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """q after a small displacement u, to second order in u: for derivatives at u = 0.
+        """q after a small displacement u, to second order in u: for derivatives at u =
+        0.
 
-        Equation: `x + u_x`, and the quaternion `e (1 - |h|^2 / 2, h)`, h half the turn in the axes
-        of the body. First and second derivatives at u = 0 are those of `moved`, without its
-        `sin|h| / |h|`, which is 0 / 0 there.
+        Equation: `x + u_x`, and the quaternion `e (1 - |h|^2 / 2, h)`, h half the turn
+        in the axes of the body. First and second derivatives at u = 0 are those of
+        `moved`, without its `sin|h| / |h|`, which is 0 / 0 there.
         """
         if not self.quaternions:
             return q + u
@@ -222,61 +257,93 @@ class RigidBodies(Body):
         )
 
     def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
-        """q moved by the places of u (n,), with quaternions `e f / |e|`, f = `turn` (b, 4)."""
-        q, u, table = self.of_bodies(q), self.of_bodies(u), _QUATERNION_PRODUCT.astype(q.dtype)
+        """q moved by the places of u (n,), with quaternions `e f / |e|`, f = `turn` (b,
+        4).
+        """
+        q, u, table = (
+            self.of_bodies(q),
+            self.of_bodies(u),
+            _QUATERNION_PRODUCT.astype(q.dtype),
+        )
         _, e = lengths(q[:, 3:])
-        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])  # sum_jk table_ijk e_j f_k
+        # sum_jk table_ijk e_j f_k
+        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
         return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
 
     @property
     def base_directions(self) -> jax.Array:
-        """Velocities (n, d) of all bodies that move with their planes along each axis."""
+        """Velocities (n, d) of all bodies that move with their planes along each
+        axis.
+        """
         d = self.dimension
-        return jnp.tile(jnp.eye(d + self.angular, d, dtype=self.masses.dtype), (self.count, 1))
+        return jnp.tile(
+            jnp.eye(d + self.angular, d, dtype=self.masses.dtype), (self.count, 1)
+        )
 
     def gravity(self, acceleration: Any) -> LinearPotential:
-        """Potential `V = g sum m_i h_i` [J], h the height: y in the plane, z in space [m]."""
+        """Potential `V = g sum m_i h_i` [J], h the height: y in the plane, z in space
+        [m].
+        """
         d = self.dimension
-        size = 7 if self.quaternions else d + self.angular
-        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)  # h among a body's coordinates
+        if self.quaternions:
+            size = 7
+        else:
+            size = d + self.angular
+        # h among a body's coordinates
+        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)
         return LinearPotential((self.masses[:, None] * up).reshape(-1) * acceleration)
 
     # ---- positions and velocities of points
 
     def turns(self, at: jax.Array) -> jax.Array:
-        """Rotation matrices R (.., d, d) of bodies at coordinates (.., c), to the axes of space."""
+        """Rotation matrices R (.., d, d) of bodies at coordinates (.., c), to the axes
+        of space.
+        """
         if self.quaternions:
             return rotation(at[..., 3:])
         if self.dimension == 3:  # spheres of a pile: their turns do not matter
             return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (*at.shape[:-1], 3, 3))
-        c, s = jnp.cos(at[..., 2]), jnp.sin(at[..., 2])
+        c = jnp.cos(at[..., 2])
+        s = jnp.sin(at[..., 2])
         return jnp.stack([c, -s, s, c], axis=-1).reshape(*c.shape, 2, 2)
 
     def placed(self, q: jax.Array) -> Placed:
-        """Orientations and points of all bodies at q, in a `Bodies` the fixed ones last."""
+        """Orientations and points of all bodies at q, in a `Bodies` the fixed ones
+        last.
+        """
         return self.placed_at(self.all_bodies(q), self.points)
 
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
-        """Orientations R and points `x + R c` of bodies with points c (b, P, d) at (b, ..)."""
-        turns, centre = self.turns(at), at[:, None, : self.dimension]
+        """Orientations R and points `x + R c` of bodies with points c (b, P, d) at (b,
+        ..).
+        """
+        turns = self.turns(at)
+        centre = at[:, None, : self.dimension]
         if all(shape.centred for shape in self.shapes):
             return Placed(turns, centre)
         return Placed(turns, centre + times(turns[:, None], points))
 
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps, points and normals (m,) at q; `between` holds the bodies of each contact."""
+        """Gaps, points and normals (m,) at q; `between` holds the bodies of each
+        contact.
+        """
         return self.on_planes(self.placed(q).points)
 
     def on_planes(self, points: jax.Array) -> ContactPoints:
-        """Contacts (w p,) of the p contact points among points x (b, P, d) with the w planes.
+        """Contacts (w p,) of the p contact points among points x (b, P, d) with the w
+        planes.
 
-        Equation: `f = n . x - c - r` with the plane's normal n and distance c, and the body's rim
-        r; the contact point is `x - r n`.
+        Equation: `f = n . x - c - r` with the plane's normal n and distance c, and the
+        body's rim r; the contact point is `x - r n`.
         """
-        (body, number), d = self.rows(), self.dimension
+        body, number = self.rows()
+        d = self.dimension
         row = body * points.shape[1] + number
-        points, rim = points.reshape(-1, d)[row], self.rims[body]
-        n = jnp.broadcast_to(self.planes[:, None, :d], (len(self.planes), *points.shape))
+        points = points.reshape(-1, d)[row]
+        rim = self.rims[body]
+        n = jnp.broadcast_to(
+            self.planes[:, None, :d], (len(self.planes), *points.shape)
+        )
         gap = jnp.sum(n * points[None], axis=2) - self.planes[:, d:] - rim[None]
         point = points[None] - rim[None, :, None] * n
         return ContactPoints(gap.reshape(-1), point.reshape(-1, d), n.reshape(-1, d))
@@ -293,7 +360,9 @@ class RigidBodies(Body):
 
     @full_precision
     def tangents(self, q: jax.Array) -> jax.Array | None:
-        """H_t (n, m), in space (n, 2 m): `H_t^T v` is the velocity of body i along body j."""
+        """H_t (n, m), in space (n, 2 m): `H_t^T v` is the velocity of body i along body
+        j.
+        """
         return self.directions(q).tangents
 
     @full_precision
@@ -302,70 +371,106 @@ class RigidBodies(Body):
         gap, point, normal = self.contacts(q)
         directions = normal[:, None]
         if not with_tangents:
-            return Directions(gap, self._relative_jacobian(q, point, directions)[..., 0], None)
+            return Directions(
+                gap, self._relative_jacobian(q, point, directions)[..., 0], None
+            )
         directions = jnp.concatenate([directions, self.unit_tangents(normal)], axis=1)
         jacobian = self._relative_jacobian(q, point, directions)
-        return Directions(gap, jacobian[..., 0], jacobian[..., 1:].reshape(len(jacobian), -1))
+        return Directions(
+            gap, jacobian[..., 0], jacobian[..., 1:].reshape(len(jacobian), -1)
+        )
 
     def unit_tangents(self, normal: jax.Array) -> jax.Array:
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
         return tangents_of(normal)
 
-    def contact_jacobian(self, at: jax.Array, point: jax.Array, directions: jax.Array) -> jax.Array:
-        """J (.., k, velocities of a body): `J v` is the velocity of its point along k directions.
+    def contact_jacobian(
+        self, at: jax.Array, point: jax.Array, directions: jax.Array
+    ) -> jax.Array:
+        """J (.., k, velocities of a body): `J v` is the velocity of its point along k
+        directions.
 
-        Equation: row k is `J_k = [d_k, r x d_k]`, r the lever arm from the body to the point; with
-        quaternions `r x d_k` in the axes of the body.
+        Equation: row k is `J_k = [d_k, r x d_k]`, r the lever arm from the body to the
+        point; with quaternions `r x d_k` in the axes of the body.
 
         Args:
-            at: coordinates of the bodies (.., c); leading axes of all three are broadcast.
+            at: coordinates of the bodies (.., c); leading axes of all three are
+                broadcast.
             point: (.., d) [m].
             directions: unit vectors d_k (.., k, d).
         """
-        lever, along = (point - at[..., : self.dimension])[..., None, :], directions
+        lever = (point - at[..., : self.dimension])[..., None, :]
+        along = directions
         if self.dimension == 2:
-            around = (lever[..., 0] * along[..., 1] - lever[..., 1] * along[..., 0])[..., None]
+            around = (lever[..., 0] * along[..., 1] - lever[..., 1] * along[..., 0])[
+                ..., None
+            ]
         else:
             around = cross(lever, along)
         if self.quaternions:  # omega is in the axes of the body
-            around = times(jnp.swapaxes(self.turns(at), -1, -2)[..., None, :, :], around)
+            around = times(
+                jnp.swapaxes(self.turns(at), -1, -2)[..., None, :, :], around
+            )
         along = jnp.broadcast_to(along, (*around.shape[:-1], self.dimension))
         return jnp.concatenate([along, around], axis=-1)
 
     def _relative_jacobian(
         self, q: jax.Array, point: jax.Array, directions: jax.Array
     ) -> jax.Array:
-        """J (n, m, k): `J^T v` are velocities of body i relative to body j at m contacts.
+        """J (n, m, k): `J^T v` are velocities of body i relative to body j at m
+        contacts.
 
-        They are taken at contact points `point` (m, d) [m] along unit `directions` (m, k, d).
+        They are taken at contact points `point` (m, d) [m] along unit `directions` (m,
+        k, d).
         """
         pairs = self.pairs_in_contact()
-        movers = pairs if (pairs[:, 1] >= 0).any() else pairs[:, :1]  # a plane does not move
+        # a plane does not move
+        if (pairs[:, 1] >= 0).any():
+            movers = pairs
+        else:
+            movers = pairs[:, :1]
         at = self.of_bodies(q)[movers]
         jacobian = self.contact_jacobian(at, point[:, None], directions[:, None])
         jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, i or j, k, velocities)
-        # by JAX: of thousands of bodies only the shapes are needed, and this would fill the memory
-        own = jnp.asarray(movers)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
+        # by JAX: of thousands of bodies only the shapes are needed, and this would fill
+        # the memory
+        own = (
+            jnp.asarray(movers)[:, :, None]
+            == np.arange(self.count, dtype=np.int32)[None, None]
+        )
         # (m, body, k, velocities)
-        rows = jnp.sum(jnp.where(own[..., None, None], jacobian[:, :, None], 0.0), axis=1)
+        rows = jnp.sum(
+            jnp.where(own[..., None, None], jacobian[:, :, None], 0.0), axis=1
+        )
         velocities = self.count * (self.dimension + self.angular)
         return rows.transpose(1, 3, 0, 2).reshape(velocities, *directions.shape[:2])
 
     @full_precision
     def at(self, positions: Any, turns: Any = None) -> jax.Array:
-        """q (n,) of bodies at `positions` (b, d) [m], with angles (b,) [rad] or quaternions (b, 4).
+        """q (n,) of bodies at `positions` (b, d) [m], with angles (b,) [rad] or
+        quaternions (b, 4).
 
-        Positions are those of the centres of mass, in space of the middles of the shapes:
+        Positions are those of the centres of mass, in space of the middles of the
+        shapes:
         `x = position - R middle`. `turns` None: 0, or no rotation.
         """
-        d, count = self.dimension, self.count
+        d = self.dimension
+        count = self.count
         places = as_numbers("positions", positions, (count, d), "one for each body")
         if not self.quaternions:
-            turning = jnp.zeros((count, self.angular)) if turns is None else turns
+            if turns is None:
+                turning = jnp.zeros((count, self.angular))
+            else:
+                turning = turns
             turning = as_float_array("turns", turning).reshape(-1, self.angular)
             check_shape("turns", turning, (count, self.angular), "of each body")
-            return jnp.concatenate([places, turning.astype(places.dtype)], axis=1).reshape(-1)
-        unit = [_UPRIGHT] * count if turns is None else turns
+            return jnp.concatenate(
+                [places, turning.astype(places.dtype)], axis=1
+            ).reshape(-1)
+        if turns is None:
+            unit = [_UPRIGHT] * count
+        else:
+            unit = turns
         e = jnp.stack([unit_quaternion(x) for x in unit])
         check_shape("turns", e, (count, 4), "a quaternion of each body")
         centre = places - times(rotation(e), self.middles)
@@ -373,7 +478,8 @@ class RigidBodies(Body):
 
     @property
     def middles(self) -> jax.Array:
-        """Middles (b, 3) [m] of shapes in space, from the centres of mass, in the bodies' axes.
+        """Middles (b, 3) [m] of shapes in space, from the centres of mass, in the
+        bodies' axes.
 
         Each is halfway between the first and the last point.
         """
@@ -393,7 +499,9 @@ class RigidBodies(Body):
 
     @property
     def velocity_names(self) -> tuple[str, ...]:
-        """Names of v: rates of q, in space angular velocities in the axes of the bodies."""
+        """Names of v: rates of q, in space angular velocities in the axes of the
+        bodies.
+        """
         if not self.quaternions:
             return super().velocity_names
         spins = tuple(f"omega{i} [rad/s]" for i in (1, 2, 3))
@@ -401,31 +509,53 @@ class RigidBodies(Body):
 
     @property
     def floors(self) -> list[tuple[float, float]]:
-        """(angle, offset) of the planes; in space outlines have a shadow on the first one."""
+        """(angle, offset) of the planes; in space outlines have a shadow on the first
+        one.
+        """
         if self.dimension == 3:
             return []
-        return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(self.planes)]
+        return [
+            (float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(self.planes)
+        ]
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Curves (k, 2) [m] of all bodies at q; in space projected, with a shadow on a plane."""
+        """Curves (k, 2) [m] of all bodies at q; in space projected, with a shadow on a
+        plane.
+        """
         return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
         """Curves (k, 2) [m] at q by body, see `outlines`; `point` is not used."""
         at = self.all_bodies(jnp.asarray(q, self.points.dtype))
-        each = zip(self.shapes, self.points, self.rims, np.asarray(at), np.asarray(self.turns(at)))
-        draw = self._plane_curves if self.dimension == 2 else self._space_curves
+        each = zip(
+            self.shapes,
+            self.points,
+            self.rims,
+            np.asarray(at),
+            np.asarray(self.turns(at)),
+        )
+        if self.dimension == 2:
+            draw = self._plane_curves
+        else:
+            draw = self._space_curves
         return [
             draw(shape, np.asarray(points)[: shape.size], float(rim), at, turn)
             for shape, points, rim, at, turn in each
         ]
 
     def _plane_curves(
-        self, shape: Shape, points: np.ndarray, rim: float, at: np.ndarray, turn: np.ndarray
+        self,
+        shape: Shape,
+        points: np.ndarray,
+        rim: float,
+        at: np.ndarray,
+        turn: np.ndarray,
     ) -> list[np.ndarray]:
-        """Curves of a disc and one of its radii, of a polygon, or of a rod between two discs.
+        """Curves of a disc and one of its radii, of a polygon, or of a rod between two
+        discs.
 
-        The body, of points (P, 2) [m] with a `rim` [m], is at `at` (x, y, theta), R = `turn`.
+        The body, of points (P, 2) [m] with a `rim` [m], is at `at` (x, y, theta), R =
+        `turn`.
         """
         if shape.is_round:
             spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
@@ -436,11 +566,18 @@ class RigidBodies(Body):
         return [ends, *(end + rim * CIRCLE for end in ends)]
 
     def _space_curves(
-        self, shape: Shape, points: np.ndarray, rim: float, at: np.ndarray, turn: np.ndarray
+        self,
+        shape: Shape,
+        points: np.ndarray,
+        rim: float,
+        at: np.ndarray,
+        turn: np.ndarray,
     ) -> list[np.ndarray]:
-        """Projected curves, with shadows: a ball and two great circles, edges of a box, or a rod.
+        """Projected curves, with shadows: a ball and two great circles, edges of a box,
+        or a rod.
 
-        The body, of points (P, 3) [m] with a `rim` [m], has its centre of mass at `at`, R = `turn`.
+        The body, of points (P, 3) [m] with a `rim` [m], has its centre of mass at `at`,
+        R = `turn`.
         """
         middle = 0.5 * (points[0] + points[-1])
         curve = points
@@ -452,20 +589,28 @@ class RigidBodies(Body):
         drawn = self.with_shadow(at[:3] + curve @ turn.T)
         if shape.is_round:
             return [*drawn, projected(at[:3] + turn @ middle) + rim * CIRCLE]
-        return drawn if shape.faces else [*drawn, *(end + rim * CIRCLE for end in drawn[0])]
+        if shape.faces:
+            return drawn
+        return [*drawn, *(end + rim * CIRCLE for end in drawn[0])]
 
     def with_shadow(self, curve: np.ndarray) -> list[np.ndarray]:
-        """Projections (k, 2) of a curve x (k, 3) [m], and of its shadow on the first plane.
+        """Projections (k, 2) of a curve x (k, 3) [m], and of its shadow on the first
+        plane.
 
         Equation: the shadow is `x - (n . x - c) n`; without planes on z = 0.
         """
-        plane = np.asarray(self.planes)[0] if len(self.planes) else np.array([0.0, 0, 1, 0])
+        if len(self.planes):
+            plane = np.asarray(self.planes)[0]
+        else:
+            plane = np.array([0.0, 0, 1, 0])
         height = curve @ plane[:3] - plane[3]
         return [projected(curve), projected(curve - np.outer(height, plane[:3]))]
 
 
 class RigidBody(RigidBodies):
-    """One rigid body over the ground y = 0, or in space over a plane through the origin."""
+    """One rigid body over the ground y = 0, or in space over a plane through the
+    origin.
+    """
 
     def _set(
         self,
@@ -476,7 +621,8 @@ class RigidBody(RigidBodies):
         rim: Any,
         normal: Any,
     ) -> None:
-        """Set the fields of `RigidBodies` for one body and one plane through the origin.
+        """Set the fields of `RigidBodies` for one body and one plane through the
+        origin.
 
         Args:
             points: c (P, d) from the centre of mass [m].
@@ -486,10 +632,14 @@ class RigidBody(RigidBodies):
             rim: radius about the points [m].
             normal: unit normal of the plane (d,).
         """
-        self.masses, self.inertias = positive("mass", mass)[None], inertia[None]
-        self.points, self.shapes = points[None], (shape,)
+        self.masses = positive("mass", mass)[None]
+        self.inertias = inertia[None]
+        self.points = points[None]
+        self.shapes = (shape,)
         self.rims = jnp.asarray(rim, points.dtype)[None]
-        self.planes = jnp.append(jnp.asarray(normal, points.dtype), 0.0)[None].astype(points.dtype)
+        self.planes = jnp.append(jnp.asarray(normal, points.dtype), 0.0)[None].astype(
+            points.dtype
+        )
 
     @property
     def corners(self) -> jax.Array:
@@ -498,27 +648,37 @@ class RigidBody(RigidBodies):
 
     @property
     def radius(self) -> jax.Array:
-        """Radius of a disc or sphere, of the ends of a dimer, or rounding of a box () [m]."""
+        """Radius of a disc or sphere, of the ends of a dimer, or rounding of a box ()
+        [m].
+        """
         return self.rims[0]
 
     @property
     def inertia(self) -> jax.Array:
-        """About the centre of mass, () in the plane, (3,) or (3, 3) in space [kg m^2]."""
-        return self.inertias[0, 0] if self.dimension == 2 else self.inertias[0]
+        """About the centre of mass, () in the plane, (3,) or (3, 3) in space [kg
+        m^2].
+        """
+        if self.dimension == 2:
+            return self.inertias[0, 0]
+        return self.inertias[0]
 
     def unit_tangents(self, normal: jax.Array) -> jax.Array:
-        """Unit tangents (m, d - 1, d) of unit normals n (m, d); in space t_1 has no y component.
+        """Unit tangents (m, d - 1, d) of unit normals n (m, d); in space t_1 has no y
+        component.
 
         Equation: `t_1 = (n_z, 0, -n_x) / sqrt(n_x^2 + n_z^2)`, `t_2 = n x t_1`.
         """
         if self.dimension == 2:
             return tangents_of(normal)
         x, y, z = normal.T
-        first = jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
+        first = (
+            jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
+        )
         return jnp.stack([first, cross(normal, first)], axis=1)
 
     def at(self, position: Any, turn: Any = None) -> jax.Array:
-        """q of the body at `position` (d,) [m], turned by an angle [rad] or a quaternion (4,).
+        """q of the body at `position` (d,) [m], turned by an angle [rad] or a
+        quaternion (4,).
 
         The position is that of the centre of mass, in space of the middle of its shape.
         """
@@ -526,7 +686,9 @@ class RigidBody(RigidBodies):
         return super().at(place[None], None if turn is None else [turn])
 
     def touching(self, turn: Any = None) -> jax.Array:
-        """q at which the lowest contacts touch, turned by an angle [rad] or a quaternion (4,)."""
+        """q at which the lowest contacts touch, turned by an angle [rad] or a
+        quaternion (4,).
+        """
         if self.dimension == 2:
             return _lowered(self, number("angle", 0.0 if turn is None else turn)[None])
         return _lowered(self, unit_quaternion(_UPRIGHT if turn is None else turn))
@@ -538,7 +700,8 @@ def rotation(e: jax.Array) -> jax.Array:
 
     Equation: `R = I + 2 (s [a]x + a a^T - |a|^2 I) / |e|^2`, `[a]x b = a x b`.
     """
-    s, a = e[..., 0, None, None], e[..., 1:]
+    s = e[..., 0, None, None]
+    a = e[..., 1:]
     square = dot(e, e)[..., None, None]
     across = jnp.tensordot(a, -_CROSS.astype(e.dtype), (-1, 2))  # [a]x
     outer = a[..., :, None] * a[..., None, :]
@@ -547,7 +710,9 @@ def rotation(e: jax.Array) -> jax.Array:
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`cos(a)` and `sin(a) / a` of `square` a^2, by their series near 0: all derivatives exist."""
+    """`cos(a)` and `sin(a) / a` of `square` a^2, by their series near 0: all
+    derivatives exist.
+    """
     small = square < _SERIES
     a = jnp.sqrt(jnp.where(small, 1.0, square))
     x = jnp.where(small, square, 0.0)
@@ -558,8 +723,12 @@ def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @full_precision
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Vector products `a x b` (.., 3), in fewer operations to compile than `jnp.cross`."""
-    return jnp.sum(a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1)
+    """Vector products `a x b` (.., 3), in fewer operations to compile than
+    `jnp.cross`.
+    """
+    return jnp.sum(
+        a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1
+    )
 
 
 def tangents_of(normal: jax.Array) -> jax.Array:
@@ -582,20 +751,26 @@ def times(matrices: jax.Array, vectors: jax.Array) -> jax.Array:
 
 @jax.jit  # operation by operation JAX would compile thirty programs
 def _lowered(body: RigidBody, turn: jax.Array) -> jax.Array:
-    """q of a body with the angle (1,) or quaternion (4,) `turn`, whose least gap to its plane is 0.
+    """q of a body with the angle (1,) or quaternion (4,) `turn`, whose least gap to its
+    plane is 0.
 
     Equation: `x = -min f n`, f the gaps with the centre of mass at the origin.
     """
     d = body.dimension
     q = jnp.concatenate([jnp.zeros(d, turn.dtype), turn])
-    return q.at[:d].set(-jnp.min(body.gap_function(q)) * body.planes[0, :d].astype(q.dtype))
+    return q.at[:d].set(
+        -jnp.min(body.gap_function(q)) * body.planes[0, :d].astype(q.dtype)
+    )
 
 
 def unit_quaternion(quaternion: Any) -> jax.Array:
-    """The argument as a quaternion (4,), scalar first; raise a ValueError unless of length 1."""
+    """The argument as a quaternion (4,), scalar first; raise a ValueError unless of
+    length 1.
+    """
     e = as_numbers("quaternion", quaternion, (4,), "scalar first")
     if not is_traced(e) and abs(float(np.linalg.norm(e)) - 1) > UNIT_WITHIN:
         raise ValueError(
-            f"Argument `quaternion` must have length 1, but has length {np.linalg.norm(e):g}."
+            f"Argument `quaternion` must have length 1, but has length "
+            f"{np.linalg.norm(e):g}."
         )
     return e

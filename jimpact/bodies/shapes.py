@@ -20,11 +20,13 @@ from jimpact.tools.checks import (
 )
 from jimpact.tools.compiling import full_precision
 
-# [rad] of a round coin over its plane: below it the lowest points of its rims turn about the axis
-# within a few steps. Ten times more ends motions of coins that fall flat earlier.
+# [rad] of a round coin over its plane: below it the lowest points of its rims turn
+# about the axis within a few steps. Ten times more ends motions of coins that fall flat
+# earlier.
 FLAT = 1e-3
 LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
-_FULL_TURN = 1e-6  # [rad] rounding of the angles of a polygon; ten times more would do as well
+# [rad] rounding of the angles of a polygon; ten times more would do as well
+_FULL_TURN = 1e-6
 _SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
 _CONVEX = "must be those of a convex polygon, in order around it"
 _SIGNS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])  # corners of a box
@@ -36,25 +38,31 @@ class _PlanarBody(RigidBody):
     def _make(
         self, points: jax.Array, mass: Any, inertia: Any, shape: Shape, rim: Any = 0.0
     ) -> None:
-        """Set the fields of a body with points (P, 2) [m] over the ground; see `RigidBody._set`."""
-        self._set(points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0))
+        """Set the fields of a body with points (P, 2) [m] over the ground; see
+        `RigidBody._set`.
+        """
+        self._set(
+            points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0)
+        )
 
 
 class Block(_PlanarBody):
-    """A rigid rectangle over the ground; q = (x, y, theta) of its centre, counter-clockwise.
+    """A rigid rectangle over the ground; q = (x, y, theta) of its centre.
 
-    Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, width L, height l; contact 1
-    is the right lower corner B, contact 2 the left one A. Tangents are the corners' positions
-    along the ground, `x + (l/2) sin(theta) +/- (L/2) cos(theta)`. Contacts 3 and 4 are the left
-    and the right upper corner: overturned, the block lies on another side.
+    Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, width L, height l;
+    contact 1 is the right lower corner B, contact 2 the left one A. Tangents are the
+    corners' positions along the ground, `x + (l/2) sin(theta) +/- (L/2) cos(theta)`.
+    Contacts 3 and 4 are the left and the right upper corner: overturned, the block lies
+    on another side.
 
     Args:
         width: L > 0 [m].
         height: l > 0 [m].
         mass: m > 0 [kg].
         inertia: I about the centre [kg m^2]; None: homogeneous, `m (l^2 + L^2) / 12`.
-        corners: 'all' four; or 'base', the lower two of the literature on rocking: then the gap
-            function holds while no upper corner is below the ground, see `valid`.
+        corners: 'all' four; or 'base', the lower two of the literature on rocking: then
+            the gap function holds while no upper corner is below the ground, see
+            `valid`.
 
     Raises:
         ValueError: sizes, mass or inertia not positive, another word for `corners`.
@@ -77,14 +85,21 @@ class Block(_PlanarBody):
         inertia: Any = None,
         corners: str = "all",
     ):
-        """Set the corners `(+/- L/2, +/- l/2)` and the moment of inertia, see the class."""
-        width, height = positive("width", width), positive("height", height)
+        """Set the corners `(+/- L/2, +/- l/2)` and the moment of inertia, see the
+        class.
+        """
+        width = positive("width", width)
+        height = positive("height", height)
         if inertia is None:
             inertia = positive("mass", mass) * (height**2 + width**2) / 12
         check_choice("corners", corners, ("all", "base"))
-        w, h = 0.5 * width, 0.5 * height
-        points = jnp.stack([jnp.stack([-w, w, w, -w]), jnp.stack([-h, -h, h, h])], axis=1)
-        order = (1, 0, 3, 2) if corners == "all" else (1, 0)  # contact 1 is the right lower corner
+        w = 0.5 * width
+        h = 0.5 * height
+        points = jnp.stack(
+            [jnp.stack([-w, w, w, -w]), jnp.stack([-h, -h, h, h])], axis=1
+        )
+        # contact 1 is the right lower corner
+        order = (1, 0, 3, 2) if corners == "all" else (1, 0)
         self._make(points, mass, inertia, Shape(order, 4, faces=True, centred=False))
 
     @property
@@ -93,7 +108,9 @@ class Block(_PlanarBody):
         return "no upper corner below the ground: or give corners='all'"
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """With the lower corners only: height () of the lower one of the upper corners [m]."""
+        """With the lower corners only: height () of the lower one of the upper corners
+        [m].
+        """
         if len(self.shapes[0].order) == 4:
             return super().valid(q)
         return jnp.min(self.placed(q).points[0, 2:, 1])
@@ -102,21 +119,23 @@ class Block(_PlanarBody):
 class Polygon(_PlanarBody):
     """A convex polygon over the ground; q = (x, y, theta) of its centre of mass.
 
-    Equation: `f_i = y + (R(theta) c_i)_y`, c_i corner i from the centre of mass; tangents are the
-    corners' positions along the ground, `x + (R(theta) c_i)_x`. One contact a corner, in the order
+    Equation: `f_i = y + (R(theta) c_i)_y`, c_i corner i from the centre of mass;
+    tangents are the corners' positions along the ground, `x + (R(theta) c_i)_x`. One
+    contact a corner, in the order
     given: a polygon may land on any side, and its gap function holds everywhere.
 
     Args:
-        corners: (k, 2) around the polygon, k >= 3, in a frame of its own [m]. Traced ones must
+        corners: (k, 2) around the polygon, k >= 3, in a frame of its own [m]. Traced
+            ones must
             be in counter-clockwise order.
         mass: m > 0 [kg].
         inertia: I about the centre of mass [kg m^2]; None: homogeneous.
-        centre: (2,) of mass, inside, in the frame of the corners [m]; None: homogeneous. With it
-            goes an `inertia`.
+        centre: (2,) of mass, inside, in the frame of the corners [m]; None:
+            homogeneous. With it goes an `inertia`.
 
     Raises:
-        ValueError: corners that are not those of a convex polygon, a mass or an inertia that is not
-            positive, a centre of mass that is outside or has no inertia.
+        ValueError: corners that are not those of a convex polygon, a mass or an inertia
+            that is not positive, a centre of mass that is outside or has no inertia.
 
     Source: areas and moments by Green's theorem.
 
@@ -128,11 +147,17 @@ class Polygon(_PlanarBody):
     [-1.0, -1.0]
     """
 
-    def __init__(self, corners: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
-        """Set the corners from the centre of mass, counter-clockwise, and the moment of inertia."""
+    def __init__(
+        self, corners: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None
+    ):
+        """Set the corners from the centre of mass, counter-clockwise, and the moment of
+        inertia.
+        """
         c = as_float_array("corners", corners)
         if c.ndim != 2 or c.shape[1] != 2 or c.shape[0] < 3:
-            raise ValueError(f"Argument `corners` must have shape (k, 2), k >= 3, not {c.shape}.")
+            raise ValueError(
+                f"Argument `corners` must have shape (k, 2), k >= 3, not {c.shape}."
+            )
         check_values("corners", c)
         order = _around(c)
         c = c[np.array(order)]
@@ -143,36 +168,43 @@ class Polygon(_PlanarBody):
         points = c - middle[None]
         if not is_traced(points) and not float(inner_radii(points[None])[0]) > 0:
             raise ValueError(
-                f"Argument `centre` must lie inside the polygon, but has value {middle.tolist()}."
+                f"Argument `centre` must lie inside the polygon, but has value "
+                f"{middle.tolist()}."
             )
-        self._make(points, mass, inertia, Shape(order, len(order), faces=True, centred=False))
+        self._make(
+            points, mass, inertia, Shape(order, len(order), faces=True, centred=False)
+        )
 
 
 class Disc(_PlanarBody):
     """A disc over the ground; q = (x, y, theta) of its centre of mass.
 
-    Equation: `f = y + (R(theta) c)_y - r`, c the middle of the disc from the centre of mass; its
-    lowest point slides at `x' + r theta'` where c = 0.
+    Equation: `f = y + (R(theta) c)_y - r`, c the middle of the disc from the centre of
+    mass; its lowest point slides at `x' + r theta'` where c = 0.
 
     Args:
         radius: r > 0 [m].
         mass: m > 0 [kg].
         inertia: I about the centre of mass [kg m^2]; None: homogeneous, `m r^2 / 2`.
-        centre: (2,) of mass, from the middle of the disc and within it [m]; with it goes an
-            `inertia`. None: the middle.
+        centre: (2,) of mass, from the middle of the disc and within it [m]; with it
+            goes an `inertia`. None: the middle.
 
     Raises:
-        ValueError: sizes, mass or inertia not positive, a centre of mass that is outside or has no
-            inertia.
+        ValueError: sizes, mass or inertia not positive, a centre of mass that is
+            outside or has no inertia.
 
     >>> import jimpact as ji
     >>> ji.Disc(0.5, mass=2.0).scene([0.0, 0.75, 0.0]).gaps.tolist()
     [0.25]
     """
 
-    def __init__(self, radius: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
+    def __init__(
+        self, radius: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None
+    ):
         radius = positive("radius", radius)
-        inertia = _given_inertia(inertia, 0.5 * positive("mass", mass) * radius**2, centre)
+        inertia = _given_inertia(
+            inertia, 0.5 * positive("mass", mass) * radius**2, centre
+        )
         shape, middle = _round_shape(radius, centre, 2, True)
         self._make(middle[None], mass, inertia, shape, radius)
 
@@ -180,17 +212,20 @@ class Disc(_PlanarBody):
 class Dimer(_PlanarBody):
     """Two equal spheres on the ends of a rod, in a vertical plane; q = (x, y, theta).
 
-    Equation: `f_{1,2} = y +/- (L/2 + R) sin(theta) - R`, contact 1 the right sphere. The lowest
-    point of a sphere slides at `v_t = x' -/+ (L/2 + R) sin(theta) theta' + R theta'`.
+    Equation: `f_{1,2} = y +/- (L/2 + R) sin(theta) - R`, contact 1 the right sphere.
+    The lowest point of a sphere slides at `v_t = x' -/+ (L/2 + R) sin(theta) theta' + R
+    theta'`.
 
     Args:
         radius: R >= 0 of the spheres [m].
-        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch (R > 0).
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch (R >
+            0).
         sphere_mass: of one sphere, > 0 [kg].
         rod_mass: of the thin rod, >= 0 [kg].
 
     Raises:
-        ValueError: a size or mass that is negative, no mass of the spheres, no size at all.
+        ValueError: a size or mass that is negative, no mass of the spheres, no size at
+            all.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
 
@@ -203,17 +238,23 @@ class Dimer(_PlanarBody):
     1.424204
     """
 
-    def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
+    def __init__(
+        self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0
+    ):
         radius = positive("radius", radius, low_allowed=True)
         ends, mass, inertia = _dimer(radius, length, sphere_mass, rod_mass)
-        self._make(ends, mass, inertia, Shape((0, 1), 2, faces=False, centred=False), radius)
+        self._make(
+            ends, mass, inertia, Shape((0, 1), 2, faces=False, centred=False), radius
+        )
 
 
-# --------------------------------------------------------------------------------- in space
+# --------------------------------------------------------------------------------- in
+# space
 
 
 class _SpatialBody(RigidBody):
-    """A body over a plane through the origin, q = (x, y, z, e_0, e_1, e_2, e_3); see `RigidBodies`.
+    """A body over a plane through the origin, q = (x, y, z, e_0, e_1, e_2, e_3); see
+    `RigidBodies`.
 
     Contact i slides along two directions in the plane, the first one that of x.
     """
@@ -234,8 +275,10 @@ class _SpatialBody(RigidBody):
         Args:
             points: c (P, 3) from the centre of mass [m].
             mass: m > 0 [kg].
-            inertia: (3,) or (3, 3) about the centre of mass [kg m^2]; None: homogeneous.
-            homogeneous: moments (3,) of inertia of a homogeneous body, over its mass [m^2].
+            inertia: (3,) or (3, 3) about the centre of mass [kg m^2]; None:
+                homogeneous.
+            homogeneous: moments (3,) of inertia of a homogeneous body, over its mass
+                [m^2].
             centre: centre of mass as given; None: the middle of the shape.
             normal: normal of the plane (3,), z > 0, of any length.
             shape: numbers and kind of the points.
@@ -245,7 +288,8 @@ class _SpatialBody(RigidBody):
         n = as_numbers("normal", normal, (3,), "a vector")
         if not is_traced(n) and not float(n[2]) > 0:
             raise ValueError(
-                f"Argument `normal` must point up (its z > 0), but has value {n.tolist()}."
+                f"Argument `normal` must point up (its z > 0), but has value "
+                f"{n.tolist()}."
             )
         n = n / jnp.sqrt(jnp.sum(n**2))
         self._set(points, mass, _moments_in_space(inertia), shape, rim, n)
@@ -254,24 +298,27 @@ class _SpatialBody(RigidBody):
 class Box(_SpatialBody):
     """A box in space over a plane; one contact per corner, eight contacts.
 
-    Equation: c_i = middle + (+/- a/2, +/- b/2, +/- c/2), contacts in the order (-,-,-), (-,-,+),
-    (-,+,-), ... (+,+,+) of the body's axes; with `rounding` r, spheres that touch the sides.
-    `f_i = n . (x + R(e) c_i) - r`; q = (x, y, z, e_0, e_1, e_2, e_3), x the centre of mass, e a
-    unit quaternion, scalar first; velocities (x', omega), omega in the body's axes.
+    Equation: c_i = middle + (+/- a/2, +/- b/2, +/- c/2), contacts in the order (-,-,-),
+    (-,-,+), (-,+,-), ... (+,+,+) of the body's axes; with `rounding` r, spheres that
+    touch the sides.
+    `f_i = n . (x + R(e) c_i) - r`; q = (x, y, z, e_0, e_1, e_2, e_3), x the centre of
+    mass, e a unit quaternion, scalar first; velocities (x', omega), omega in the body's
+    axes.
 
     Args:
         sizes: (a, b, c) > 0 [m].
         mass: m > 0 [kg].
-        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg m^2]; None:
-            homogeneous, `m (b^2 + c^2) / 12`, ...
-        centre: (3,) of mass, from the middle of the box and inside it [m]; with it goes an
-            `inertia`. None: the middle.
+        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg
+            m^2]; None: homogeneous, `m (b^2 + c^2) / 12`, ...
+        centre: (3,) of mass, from the middle of the box and inside it [m]; with it goes
+            an `inertia`. None: the middle.
         rounding: r >= 0 of the corners, at most half the shortest size [m].
         normal: of the plane (3,), z > 0: (0, 0, 1) is level.
 
     Raises:
-        ValueError: sizes, mass or inertia not positive, moments of inertia that no body has, a
-            centre of mass outside or without inertia, a rounding that does not fit.
+        ValueError: sizes, mass or inertia not positive, moments of inertia that no body
+            has, a centre of mass outside or without inertia, a rounding that does not
+            fit.
 
     Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
 
@@ -291,13 +338,17 @@ class Box(_SpatialBody):
         rounding: Any = 0.0,
         normal: Any = LEVEL,
     ):
-        """Set the middles of the rounded corners, `middle + (+/- (a/2 - r), ..)`, and moments.
+        """Set the middles of the rounded corners, `middle + (+/- (a/2 - r), ..)`, and
+        moments.
 
-        Moments of inertia of a homogeneous box over its mass are `(b^2 + c^2) / 12`, ...
+        Moments of inertia of a homogeneous box over its mass are `(b^2 + c^2) / 12`,
+        ...
         """
         sizes = positives("sizes", as_float_array("sizes", sizes), 3)
         rounding = positive("rounding", rounding, low_allowed=True)
-        middle = -as_numbers("centre", np.zeros(3) if centre is None else centre, (3,), "a vector")
+        middle = -as_numbers(
+            "centre", np.zeros(3) if centre is None else centre, (3,), "a vector"
+        )
         if not is_traced((sizes, rounding, middle)):
             half = 0.5 * np.asarray(sizes)
             check_values("rounding", rounding, high=float(half.min()))
@@ -306,7 +357,10 @@ class Box(_SpatialBody):
                     "Argument `centre` must lie inside the box, but has value "
                     f"{(-np.asarray(middle)).tolist()}."
                 )
-        points = middle[None] + jnp.asarray(_SIGNS, sizes.dtype) * (0.5 * sizes - rounding)[None]
+        points = (
+            middle[None]
+            + jnp.asarray(_SIGNS, sizes.dtype) * (0.5 * sizes - rounding)[None]
+        )
         homogeneous = (jnp.sum(sizes**2) - sizes**2) / 12
         shape = Shape(tuple(range(8)), 8, faces=True, centred=False)
         self._make(points, mass, inertia, homogeneous, centre, normal, shape, rounding)
@@ -325,8 +379,8 @@ class Sphere(_SpatialBody):
     Args:
         radius: r > 0 [m].
         mass: m > 0 [kg].
-        inertia: about the centre of mass, scalar, (3,) along the body's axes or (3, 3) [kg m^2];
-            None: homogeneous, `2 m r^2 / 5`.
+        inertia: about the centre of mass, scalar, (3,) along the body's axes or (3, 3)
+            [kg m^2]; None: homogeneous, `2 m r^2 / 5`.
         centre: (3,) of mass, from the middle and inside [m]; with it goes an `inertia`.
         normal: of the plane (3,), z > 0: (0, 0, 1) is level.
 
@@ -347,20 +401,25 @@ class Sphere(_SpatialBody):
         centre: Any = None,
         normal: Any = LEVEL,
     ):
-        """Set the middle from the centre of mass and the moments of inertia, see the class."""
+        """Set the middle from the centre of mass and the moments of inertia, see the
+        class.
+        """
         radius = positive("radius", radius)
         isotropic = inertia is None or np.ndim(inertia) == 0
         if inertia is not None and isotropic:
             inertia = jnp.stack([number("inertia", inertia)] * 3)
         shape, middle = _round_shape(radius, centre, 3, isotropic)
         homogeneous = jnp.stack([0.4 * radius**2] * 3)
-        self._make(middle[None], mass, inertia, homogeneous, centre, normal, shape, radius)
+        self._make(
+            middle[None], mass, inertia, homogeneous, centre, normal, shape, radius
+        )
 
 
 class SpatialDimer(_SpatialBody):
-    """Two equal spheres on the ends of a rod in space over a plane; q and velocities as of `Box`.
+    """Two equal spheres on the ends of a rod in space over a plane.
 
-    Equation: the rod lies along the first axis of the body, `c_{1,2} = (+/- (L/2 + R), 0, 0)`;
+    Equation: the rod lies along the first axis of the body,
+    `c_{1,2} = (+/- (L/2 + R), 0, 0)`;
     `I = diag(I_a, I_t, I_t)`, `I_a = (4/5) m_s R^2`, I_t that of the planar `Dimer`.
 
     Args:
@@ -373,7 +432,8 @@ class SpatialDimer(_SpatialBody):
     Raises:
         ValueError: a radius or mass that is not positive, a length that is negative.
 
-    Source: own derivation; the planar case is Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
+    Source: own derivation; the planar case is Brogliato, Nonsmooth Mechanics (2016),
+    Remark 6.11.
 
     >>> import jimpact as ji
     >>> dimer = ji.SpatialDimer(radius=5 / 24, length=1.0)
@@ -389,7 +449,9 @@ class SpatialDimer(_SpatialBody):
         rod_mass: Any = 1.0,
         normal: Any = LEVEL,
     ):
-        """Set the middles of the spheres and the inertia `(I_a, I_t, I_t)`, see the class."""
+        """Set the middles of the spheres and the inertia `(I_a, I_t, I_t)`, see the
+        class.
+        """
         radius = positive("radius", radius)  # without radius no inertia about the axis
         ends, mass, across = _dimer(radius, length, sphere_mass, rod_mass)
         along = 0.8 * positive("sphere_mass", sphere_mass) * radius**2
@@ -402,20 +464,23 @@ class SpatialDimer(_SpatialBody):
 class Coin(_SpatialBody):
     """A coin, or wheel, in space over a plane; its axis is the third one of the body.
 
-    Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and h/2 on the
-    axis, touches with its lowest point `c = (-a u_1 / s, -a u_2 / s, -/+ h/2)`: the coin rolls. A
-    coin that lies flat has no such point: with `corners=N` the rims are regular polygons, with a
-    contact a corner. So it lands flat and comes to rest, and clatters where the other one rolls.
+    Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and
+    h/2 on the axis, touches with its lowest point
+    `c = (-a u_1 / s, -a u_2 / s, -/+ h/2)`: the coin rolls. A coin that lies flat has
+    no such point: with `corners=N` the rims are regular polygons, with a contact a
+    corner. So it lands flat and comes to rest, and clatters where the other one rolls.
     q and velocities as of `Box`.
 
     Args:
         radius: a > 0 [m].
         thickness: h > 0 [m].
         mass: m > 0 [kg].
-        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg m^2]; None:
-            homogeneous, `m (3 a^2 + h^2) / 12` about a diameter, `m a^2 / 2` about the axis.
-        corners: N >= 3 of each rim, 2 N contacts, those of the rim at -h/2 first; 0: round rims,
-            2 contacts, `valid` down to an angle of 1e-3 rad between coin and plane.
+        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg
+            m^2]; None: homogeneous, `m (3 a^2 + h^2) / 12` about a diameter,
+            `m a^2 / 2` about the axis.
+        corners: N >= 3 of each rim, 2 N contacts, those of the rim at -h/2 first; 0:
+            round rims, 2 contacts, `valid` down to an angle of 1e-3 rad between coin
+            and plane.
         normal: of the plane (3,), z > 0: (0, 0, 1) is level.
 
     Raises:
@@ -442,8 +507,11 @@ class Coin(_SpatialBody):
         corners: int = 0,
         normal: Any = LEVEL,
     ):
-        """Set the corners of both rims (round ones have none) and the inertia, see the class."""
-        radius, thickness = positive("radius", radius), positive("thickness", thickness)
+        """Set the corners of both rims (round ones have none) and the inertia, see the
+        class.
+        """
+        radius = positive("radius", radius)
+        thickness = positive("thickness", thickness)
         self.disc = jnp.stack([radius, thickness])
         corners = as_whole("corners", corners, 0)
         if corners in (1, 2):
@@ -451,14 +519,20 @@ class Coin(_SpatialBody):
                 f"Argument `corners` must be 0 or at least 3, but has value {corners}."
             )
         angle = 2 * np.pi / max(corners, 1) * np.arange(corners)
-        points = self._rims(jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1)))
+        points = self._rims(
+            jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        )
         across = (3 * radius**2 + thickness**2) / 12
         homogeneous = jnp.stack([across, across, 0.5 * radius**2])
-        shape = Shape(tuple(range(len(points))), len(points), faces=False, centred=False)
+        shape = Shape(
+            tuple(range(len(points))), len(points), faces=False, centred=False
+        )
         self._make(points, mass, inertia, homogeneous, None, normal, shape)
 
     def _rims(self, outward: jax.Array) -> jax.Array:
-        """Points (2 k, 3) of both rims in the directions `outward` (k, 2) from the axis."""
+        """Points (2 k, 3) of both rims in the directions `outward` (k, 2) from the
+        axis.
+        """
         radius, thickness = self.disc
         outward = outward.astype(self.disc.dtype)
         levels = 0.5 * thickness * jnp.array([-1.0, 1.0], outward.dtype)
@@ -477,17 +551,22 @@ class Coin(_SpatialBody):
 
     @full_precision
     def _toward(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Rotation matrix R (3, 3) at q, and the plane's normal in the body's axes, R^T n (3,)."""
+        """Rotation matrix R (3, 3) at q, and the plane's normal in the body's axes, R^T
+        n (3,).
+        """
         turn = rotation(q[3:])
         return turn, self.planes[0, :3] @ turn
 
     @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps, points and normals (m,) of its corners, or of the lowest point of round rims."""
+        """Gaps, points and normals (m,) of its corners, or of the lowest point of round
+        rims.
+        """
         if self.points.size:
             return super().contacts(q)
         turn, up = self._toward(q)
-        lowest = -lengths(up[None, :2])[1]  # direction from the axis to them, -(u_1, u_2) / s
+        # direction from the axis to them, -(u_1, u_2) / s
+        lowest = -lengths(up[None, :2])[1]
         points = q[None, :3] + self._rims(lowest) @ turn.T
         n = jnp.broadcast_to(self.planes[:, :3], points.shape)
         return ContactPoints(jnp.sum(n * points, axis=1), points, n)
@@ -497,17 +576,24 @@ class Coin(_SpatialBody):
         return np.array([[0, -1]] * (self.points.shape[1] or 2), np.int32)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """Margin () of the quaternion's length; of a round coin also `s - FLAT`, see the class."""
+        """Margin () of the quaternion's length; of a round coin also `s - FLAT`, see
+        the class.
+        """
         length = super().valid(q)
         if self.points.size:
             return length
         return jnp.minimum(length, lengths(self._toward(q)[1][None, :2])[0][0] - FLAT)
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """Projected curves (k, 2) [m] at q: both rims, a diameter of the upper one, and shadows."""
+        """Projected curves (k, 2) [m] at q: both rims, a diameter of the upper one, and
+        shadows.
+        """
         corners = self.points.shape[1] // 2
         around = np.linspace(0, 2 * np.pi, corners + 1)
-        ring = np.stack([np.cos(around), np.sin(around)], axis=1) if corners else CIRCLE
+        if corners:
+            ring = np.stack([np.cos(around), np.sin(around)], axis=1)
+        else:
+            ring = CIRCLE
         rims = np.asarray(self._rims(jnp.asarray(ring))).reshape(2, -1, 3)
         across = np.asarray(self._rims(jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])))
         turn = np.asarray(rotation(jnp.asarray(q)[3:]))
@@ -515,30 +601,39 @@ class Coin(_SpatialBody):
         return [[line for curve in curves for line in self.with_shadow(curve)]]
 
 
-# ------------------------------------------------------------------------------- construction
+# -------------------------------------------------------------------------------
+# construction
 
 
 def _given_inertia(inertia: Any, homogeneous: jax.Array, centre: Any) -> Any:
-    """The argument `inertia`; None: that of a homogeneous body, where no `centre` is given."""
+    """The argument `inertia`; None: that of a homogeneous body, where no `centre` is
+    given.
+    """
     if inertia is None and centre is not None:
         raise ValueError("Argument `inertia` must be given with `centre`.")
-    return homogeneous if inertia is None else inertia
+    if inertia is None:
+        return homogeneous
+    return inertia
 
 
 def _round_shape(
     radius: jax.Array, centre: Any, d: int, isotropic: bool
 ) -> tuple[Shape, jax.Array]:
-    """`Shape` of a disc or sphere, and its middle (d,) [m] from the centre of mass, `-centre`.
+    """`Shape` of a disc or sphere, and its middle (d,) [m] from the centre of mass,
+    `-centre`.
 
-    `radius` [m], `centre` of mass from the middle (d,) [m] or None; `isotropic`: equal moments of
-    inertia about all axes.
+    `radius` [m], `centre` of mass from the middle (d,) [m] or None; `isotropic`: equal
+    moments of inertia about all axes.
     """
     middle = jnp.zeros(d, radius.dtype)
     if centre is not None:
         middle = -as_numbers("centre", centre, (d,), "a vector")
-        if not is_traced((middle, radius)) and not np.linalg.norm(middle) <= float(radius):
+        if not is_traced((middle, radius)) and not np.linalg.norm(middle) <= float(
+            radius
+        ):
             raise ValueError(
-                f"Argument `centre` must be at most {float(radius):g} m from the middle, but has "
+                f"Argument `centre` must be at most {float(radius):g} m from the "
+                f"middle, but has "
                 f"value {(-middle).tolist()}."
             )
     return Shape((0,), 1, faces=False, centred=isotropic and centre is None), middle
@@ -547,7 +642,8 @@ def _round_shape(
 def _dimer(
     radius: jax.Array, length: Any, sphere_mass: Any, rod_mass: Any
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Centres (2, 2) [m] of the spheres of a dimer, its mass [kg], and its inertia [kg m^2].
+    """Centres (2, 2) [m] of the spheres of a dimer, its mass [kg], and its inertia [kg
+    m^2].
 
     Equation: with the arm `a = L / 2 + R`, about an axis across the rod,
     `I = 2 m_s (2 R^2 / 5 + a^2) + m_r L^2 / 12`.
@@ -555,7 +651,9 @@ def _dimer(
     length = positive("length", length, low_allowed=True)
     arm = 0.5 * length + radius  # of a sphere's centre from the middle
     if not is_traced(arm) and arm <= 0:
-        raise ValueError("Argument `length` must be > 0 where `radius` is 0, but has value 0.")
+        raise ValueError(
+            "Argument `length` must be > 0 where `radius` is 0, but has value 0."
+        )
     sphere = positive("sphere_mass", sphere_mass)
     rod = positive("rod_mass", rod_mass, low_allowed=True)
     ends = arm * jnp.array([[1.0, 0.0], [-1.0, 0.0]], arm.dtype)
@@ -564,23 +662,29 @@ def _dimer(
 
 
 def _moments_in_space(value: Any) -> jax.Array:
-    """The argument `inertia` as (3,) or (3, 3) [kg m^2]; raise a ValueError where no body has it.
+    """The argument `inertia` as (3,) or (3, 3) [kg m^2]; raise a ValueError where no
+    body has it.
 
     Principal moments obey `I_3 <= I_1 + I_2`.
     """
     inertia = as_float_array("inertia", value)
     if inertia.shape not in ((3,), (3, 3)):
-        raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {inertia.shape}.")
+        raise ValueError(
+            f"Argument `inertia` must have shape (3,) or (3, 3), not {inertia.shape}."
+        )
     if is_traced(inertia):
         return inertia
     try:
         check_mass(inertia)
     except ValueError as error:
-        raise ValueError(str(error).replace("`mass`", "`inertia`").replace("M ", "I ")) from None
+        raise ValueError(
+            str(error).replace("`mass`", "`inertia`").replace("M ", "I ")
+        ) from None
     moments = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
     if moments[2] > (1 + _SLACK) * (moments[0] + moments[1]):
         raise ValueError(
-            "Argument `inertia` must have principal moments none of which is more than the sum of "
+            "Argument `inertia` must have principal moments none of which is more than "
+            "the sum of "
             f"the others, but has {moments.tolist()}."
         )
     return inertia
@@ -589,8 +693,9 @@ def _moments_in_space(value: Any) -> jax.Array:
 def _around(corners: jax.Array) -> tuple[int, ...]:
     """Numbers of the corners (k, 2) of a convex polygon in counter-clockwise order.
 
-    They are those given, or their reverse. Raise a ValueError unless sides turn the same way at all
-    corners, by 2 pi in all; corners that are traced are taken as they are.
+    They are those given, or their reverse. Raise a ValueError unless sides turn the
+    same way at all corners, by 2 pi in all; corners that are traced are taken as they
+    are.
     """
     k = corners.shape[0]
     if is_traced(corners):
@@ -598,18 +703,24 @@ def _around(corners: jax.Array) -> tuple[int, ...]:
     c = np.asarray(corners, float)
     side = np.roll(c, -1, axis=0) - c
     after = np.roll(side, -1, axis=0)
-    turn = np.arctan2(_cross(side, after), np.sum(side * after, axis=1))  # [rad] between sides
+    # [rad] between sides
+    turn = np.arctan2(_cross(side, after), np.sum(side * after, axis=1))
     around = np.sign(turn.sum())  # 1: counter-clockwise
     bad = np.flatnonzero(~((turn * around > 0) & (turn * around < np.pi)))
     if bad.size:
         worst = int(bad[0] + 1) % k
         raise ValueError(
-            f"Argument `corners` {_CONVEX}, but it does not turn the same way at corner {worst}, "
+            f"Argument `corners` {_CONVEX}, but it does not turn the same way at "
+            f"corner {worst}, "
             f"{c[worst].tolist()}."
         )
     if abs(abs(turn.sum()) - 2 * np.pi) > _FULL_TURN:
-        raise ValueError(f"Argument `corners` {_CONVEX}, but they go around it more than once.")
-    return tuple(range(k)) if around > 0 else tuple(reversed(range(k)))
+        raise ValueError(
+            f"Argument `corners` {_CONVEX}, but they go around it more than once."
+        )
+    if around > 0:
+        return tuple(range(k))
+    return tuple(reversed(range(k)))
 
 
 def _cross(a: Any, b: Any) -> Any:
@@ -619,10 +730,11 @@ def _cross(a: Any, b: Any) -> Any:
 
 @jax.jit  # operation by operation JAX would compile thirty programs
 def inner_radii(corners: jax.Array) -> jax.Array:
-    """Distances (b,) [m] of the origin from the nearest side of counter-clockwise polygons.
+    """Distances (b,) [m] of the origin from the nearest side of counter-clockwise
+    polygons.
 
-    Equation: `min(c_i x s_i / |s_i|)` over the sides s_i from `corners` c_i (b, K, 2) with a
-    length, negative for an origin outside; infinite for a single point.
+    Equation: `min(c_i x s_i / |s_i|)` over the sides s_i from `corners` c_i (b, K, 2)
+    with a length, negative for an origin outside; infinite for a single point.
     """
     side = jnp.roll(corners, -1, axis=1) - corners
     length = jnp.sqrt(jnp.sum(side**2, axis=2))
@@ -632,11 +744,13 @@ def inner_radii(corners: jax.Array) -> jax.Array:
 
 @jax.jit
 def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Centroid (2,) [m], and moment of inertia about it over the mass () [m^2], of a polygon.
+    """Centroid (2,) [m], and moment of inertia about it over the mass () [m^2], of a
+    polygon.
 
     Equation: with corners a_i, b_i of side i from corner 0 of the `ring` (k, 2), and
-    `A_i = a_i x b_i`, the centroid is `sum A_i (a_i + b_i) / (3 sum A_i)`, the moment about corner
-    0 is `sum A_i (a_i^2 + a_i . b_i + b_i^2) / (6 sum A_i)`, less the centroid's square.
+    `A_i = a_i x b_i`, the centroid is `sum A_i (a_i + b_i) / (3 sum A_i)`, the moment
+    about corner 0 is `sum A_i (a_i^2 + a_i . b_i + b_i^2) / (6 sum A_i)`, less the
+    centroid's square.
     """
     start = ring - ring[:1]  # about a corner: far from the origin, areas would cancel
     end = jnp.roll(start, -1, axis=0)

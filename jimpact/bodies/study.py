@@ -11,13 +11,14 @@ from jimpact.tools.study_tables import check_keys
 
 # classes of bodies by name, which a study writes in any case
 BODIES = {name: getattr(bodies, name) for name in dir(bodies) if name in dir(ji)}
-# Units of the bodies' arguments, which a study writes behind their names. Words and directions have
-# no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
-# `at`), which the classes document.
+# Units of the bodies' arguments, which a study writes behind their names. Words and
+# directions have no unit here, nor have lists of points [m] or of mixed units
+# (`corners` of a Polygon, `planes`, `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(
-        ("width", "height", "length", "thickness", "radius", "radii", "gaps", "sizes"), "m"
+        ("width", "height", "length", "thickness", "radius", "radii", "gaps", "sizes"),
+        "m",
     ),
     **dict.fromkeys(("centre", "rounding"), "m"),
     "inertia": "kg_m2",
@@ -26,11 +27,13 @@ _UNITS = {
 
 
 def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
-    """Body that a table of a study describes; `where` is the head of the table, for errors.
+    """Body that a table of a study describes; `where` is the head of the table, for
+    errors.
 
-    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the other
-    keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
-    `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of this kind themselves.
+    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case);
+    the other keys are the arguments of that class, with their units behind them:
+    `width_m`, `mass_kg`, `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of
+    this kind themselves.
     `others` are keys of the table that mean something else.
 
     >>> from jimpact.bodies.study import body_of
@@ -45,7 +48,9 @@ def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
     # key of the table, with its unit -> argument of the class
     keys = {f"{key}_{_UNITS[key]}" if key in _UNITS else key: key for key in parameters}
     required = tuple(
-        x for x, key in keys.items() if parameters[key].default is inspect.Parameter.empty
+        x
+        for x, key in keys.items()
+        if parameters[key].default is inspect.Parameter.empty
     )
     check_keys(where, table, ("kind", *keys, *others), required)
     arguments = {key: table[x] for x, key in keys.items() if x in table}

@@ -1,6 +1,7 @@
 """Commands of the command line: each takes its options and returns a result.
 
-Public names are taken from `jimpact` itself, so that a command imports no more than it needs.
+Public names are taken from `jimpact` itself, so that a command imports no more than it
+needs.
 """
 
 import re
@@ -37,17 +38,24 @@ if TYPE_CHECKING:
 
 DPI = 150  # of pictures that are pixels: readable on paper, a few hundred kB
 
-# Words of the printed results (regular expressions), and the sentences that explain them there.
+# Words of the printed results (regular expressions), and the sentences that explain
+# them there.
 GLOSSARY = {
-    r"\brank\b": "Rank: how many combinations of the free parameters the data determine.",
+    r"\brank\b": (
+        "Rank: how many combinations of the free parameters the data determine."
+    ),
     r"\(bound\)": "(bound): the fit ended at a bound of the parameter's range.",
-    r"\bAICc\b": "AICc: Akaike's information criterion, misfit against number of parameters; lower "
+    r"\bAICc\b": "AICc: Akaike's information criterion, misfit against number of "
+    "parameters; lower "
     "is better, differences below 2 mean little.",
-    r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they conserve "
+    r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they "
+    "conserve "
     "momentum.",
     r"\baccumulation\b": "Accumulation: infinitely many impacts in a finite time.",
     r"\d friction\b": "Friction: a contact begins to stick or to slip.",
-    r"\bparoxysm\b": "Paroxysm: friction jams a sliding contact, an impact without collision.",
+    r"\bparoxysm\b": (
+        "Paroxysm: friction jams a sliding contact, an impact without collision."
+    ),
     r"\bdispersion\b": "Dispersion: 0 all energy in one body, 1 equal shares.",
 }
 
@@ -60,20 +68,26 @@ class CommandResult(NamedTuple):
     picture: "Figure"
     table: Table  # for --csv
     text: str | None = None
-    more: Mapping[Path, "Figure | Callable[[Path], Any]"] = {}  # further pictures, or what writes
+    # further pictures, or what writes
+    more: Mapping[Path, "Figure | Callable[[Path], Any]"] = {}
     failure: str = ""  # what went wrong
 
 
 def run(command: options.DrawingCommand, steps: Steps) -> str:
-    """Run a command and print its result; returns what went wrong, '' if nothing did."""
-    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
+    """Run a command and print its result; returns what went wrong, '' if nothing
+    did.
+    """
+    # the program's choice; the library sets none
+    jax.config.update("jax_enable_x64", True)
     result = _COMMANDS[command.name()](command, steps)
     _show(command, result, steps)
     return result.failure
 
 
 def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) -> None:
-    """Write the pictures of a result, and print it as text, CSV or JSON, as the options say."""
+    """Write the pictures of a result, and print it as text, CSV or JSON, as the options
+    say.
+    """
     pictures: dict[Path, Any] = {command.picture(): result.picture, **result.more}
     replaced = [path for path in pictures if path.exists()]
     for path, picture in pictures.items():
@@ -85,13 +99,19 @@ def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) 
         data = {"title": result.title, "pictures": [str(path) for path in pictures]}
         print(dumps(data | as_data(result.data), indent=2))
     else:
-        text = str(result.data) if result.text is None else result.text
+        if result.text is None:
+            text = str(result.data)
+        else:
+            text = result.text
         notes = [note for word, note in GLOSSARY.items() if re.search(word, text)]
         places = [f"Picture: {path}" for path in pictures]
         lines = [result.title, text, *notes, *places]
         print("\n".join(wrapped(line) for line in lines if line))
     for path in replaced:
-        print(f"jimpact {command.name()}: {path} existed and was replaced.", file=sys.stderr)
+        print(
+            f"jimpact {command.name()}: {path} existed and was replaced.",
+            file=sys.stderr,
+        )
 
 
 def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> None:
@@ -107,19 +127,24 @@ def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> Non
     path.write_bytes(content.getvalue())
 
 
-def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
-    """Study, v- (n,) [m/s, rad/s] and measured v+ (n,), None without one, of a command's impact.
+def _impact_of(
+    command: options.ShotCommand,
+) -> tuple[Study, np.ndarray, np.ndarray | None]:
+    """Study, v- (n,) [m/s, rad/s] and measured v+ (n,), None without one, of a
+    command's impact.
 
-    v- is --velocity; without it v- and v+ are those of the study's shot --shot, and the study gets
-    the scene of this shot where shots have their own.
+    v- is --velocity; without it v- and v+ are those of the study's shot --shot, and the
+    study gets the scene of this shot where shots have their own.
     """
-    study, shot = impact_study(command.study), command.shot - 1
+    study = impact_study(command.study)
+    shot = command.shot - 1
     if command.velocity:  # given: it need not be one of the study's shots
         before = np.asarray(command.velocity, float)
         separates = np.asarray(ji.gap_velocity(study.scene, before)) >= 0
         if separates.all() and "initial_energy" not in study.parameters:
             raise ValueError(
-                "--velocity must let bodies approach each other, but no contact closes: there is "
+                "--velocity must let bodies approach each other, but no contact "
+                "closes: there is "
                 "no impact (positive velocities of a chain point to the right)."
             )
         return study, before, None
@@ -127,27 +152,38 @@ def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndar
     if data is None:
         raise ValueError("--velocity must be given, because the study has no shots.")
     if not 0 <= shot < len(data.shots):
-        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {command.shot}.")
+        raise ValueError(
+            f"--shot must lie in [1, {len(data.shots)}], but is {command.shot}."
+        )
     study = replace(study, scene=data.scene_of(study.scene, shot))
     return study, np.asarray(data.pre[shot]), np.asarray(data.post[shot])
 
 
 def _titled(study: Study, before: np.ndarray) -> str:
-    """The first line of what is printed: the study and its velocities before the impact."""
-    unit = "m/s" if study.scene.walls is not None else "m/s, rad/s"
+    """The first line of what is printed: the study and its velocities before the
+    impact.
+    """
+    if study.scene.walls is not None:
+        unit = "m/s"
+    else:
+        unit = "m/s, rad/s"
     return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) {unit}"
 
 
-# -------------------------------------------------------------------------------------------- fit
+# --------------------------------------------------------------------------------------
+# fit
 
 FRICTION_PARAMETERS = ("friction", "tangential_restitution")
-RAW, CORRECTED, ALL_FREE = "as measured", "momentum corrected", "all free"
+RAW = "as measured"
+CORRECTED = "momentum corrected"
+ALL_FREE = "all free"
 
 
 def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
     """`jimpact fit`: fit the study's law to its data; with --law all every law.
 
-    Shots are fitted up to three times, see `_fits_of`, until the time limit --limit [s].
+    Shots are fitted up to three times, see `_fits_of`, until the time limit --limit
+    [s].
     """
     if command.law == options.EVERY_LAW:
         return _fit_every_law(command, steps)
@@ -160,7 +196,9 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
     fits: dict[str, Fit] = {}
     if isinstance(study, MotionStudy):
         if command.method is not None or command.all_free:
-            raise ValueError("--method, --law all, --all-free must be left out for a motion.")
+            raise ValueError(
+                "--method, --law all, --all-free must be left out for a motion."
+            )
         fits[RAW] = study.fit(**chosen, limit=command.limit)
         steps(_fit_in_words(RAW, fits[RAW]))
         return _fits_result(study.title, fits)
@@ -169,15 +207,25 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         """The result with the fits that are done so far."""
         return _with_track(_fits_result(study.title, fits), study, command)
 
-    end = np.inf if command.limit is None else time.monotonic() + command.limit
+    if command.limit is None:
+        end = np.inf
+    else:
+        end = time.monotonic() + command.limit
     chosen |= {"method": command.method}
     for name, each in _fits_of(study, command.all_free, fits):
         left = max(end - time.monotonic(), 0.0)
         if name != RAW and left == 0.0:
             steps(f"{name}: left out, the time limit is reached")
             continue
-        profiles = None if name == RAW else False  # only the report of this fit shows them
-        limit = None if command.limit is None else left
+        # only the report of this fit shows them
+        if name == RAW:
+            profiles = None
+        else:
+            profiles = False
+        if command.limit is None:
+            limit = None
+        else:
+            limit = left
         fits[name] = each.run(**chosen, profiles=profiles, limit=limit)
         steps(_fit_in_words(name, fits[name]))
         steps.show_finished = lambda: _show(command, result(), steps)
@@ -190,9 +238,9 @@ def _fits_of(
 ) -> Iterator[tuple[str, Study]]:
     """Studies to fit one after the other, by name: variants of one study of shots.
 
-    `RAW` as it is; `CORRECTED` with velocities changed to conserve momentum, if the report of the
-    first of the `fits` finds that they do not; `ALL_FREE` with every e and stiffness ratio free, if
-    asked for.
+    `RAW` as it is; `CORRECTED` with velocities changed to conserve momentum, if the
+    report of the first of the `fits` finds that they do not; `ALL_FREE` with every e
+    and stiffness ratio free, if asked for.
     """
     with_all_free = None
     if all_free:  # fits of one law share one compiled program
@@ -209,21 +257,46 @@ def _fits_of(
 def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
     """Fits by name as a result: the first one's report and picture, a table of all."""
     text = "\n".join([str(fits[RAW]), "", *_fits_table(fits), ""])
-    heads = ("fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank")
+    heads = (
+        "fit",
+        "law",
+        "parameter",
+        "value",
+        "standard_error",
+        "rms_m_per_s",
+        "rank",
+    )
     rows = [
-        [name, type(x.law).__name__, parameter, x.value[i], x.standard_error[i], x.rms, x.rank]
+        [
+            name,
+            type(x.law).__name__,
+            parameter,
+            x.value[i],
+            x.standard_error[i],
+            x.rms,
+            x.rank,
+        ]
         for name, x in fits.items()
         for i, parameter in enumerate(x.names)
     ]
     picture = ji.plot.fit(fits[RAW], None, title)
-    return CommandResult(title, {"fits": dict(fits)}, picture, _plain_table(heads, rows), text)
+    return CommandResult(
+        title, {"fits": dict(fits)}, picture, _plain_table(heads, rows), text
+    )
 
 
-def _with_track(result: CommandResult, study: Study, command: options.FitCommand) -> CommandResult:
-    """The result, and the impacts, warnings and picture of the track that the shots are from."""
+def _with_track(
+    result: CommandResult, study: Study, command: options.FitCommand
+) -> CommandResult:
+    """The result, and the impacts, warnings and picture of the track that the shots are
+    from.
+    """
     if study.track is None:
         return result
-    text = str(result.data) if result.text is None else result.text
+    if result.text is None:
+        text = str(result.data)
+    else:
+        text = result.text
     found = {"impacts": study.track.impacts, "warnings": study.track.warnings}
     data = as_data(result.data) | {"track": found}
     place = command.picture()
@@ -237,7 +310,9 @@ def _plain_table(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
 
 
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
-    """`jimpact fit --law all`: fits of every law to the study's shots; the picture has the best."""
+    """`jimpact fit --law all`: fits of every law to the study's shots; the picture has
+    the best.
+    """
     study = impact_study(command.study)
     if study.experiments is None:
         raise ValueError(NO_DATA)
@@ -275,19 +350,29 @@ def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
 def _per_contact(study: Study) -> tuple[Study, Study | None]:
     """The study with e and k of LZB as arrays (m,), and the same with every entry free.
 
-    In the first one, entries that were one number have one label and stay equal. The second one is
-    None if the law is not LZB, has other free parameters, or is all free already.
+    In the first one, entries that were one number have one label and stay equal. The
+    second one is None if the law is not LZB, has other free parameters, or is all free
+    already.
     """
-    law, contacts = study.law, study.scene.contacts
+    law = study.law
+    contacts = study.scene.contacts
     fields = ("restitution", "stiffness")
-    if not isinstance(law, ji.LZB) or contacts < 2 or not set(study.free) <= set(fields):
+    if (
+        not isinstance(law, ji.LZB)
+        or contacts < 2
+        or not set(study.free) <= set(fields)
+    ):
         return study, None
     groups = {}  # labels (m,): 0 fixed, entries of one label are one free value
     for name in fields:
         # the study's choice: True or False, a mask (m,), or labels (m,)
-        value, choice = getattr(law, name), np.asarray(study.free.get(name, False))
+        value = getattr(law, name)
+        choice = np.asarray(study.free.get(name, False))
         one_each = np.arange(1, contacts + 1) if np.ndim(value) else 1
-        labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
+        if choice.dtype == bool:
+            labels = np.where(choice, one_each, 0)
+        else:
+            labels = choice
         groups[name] = np.broadcast_to(labels, (contacts,))
         law = with_parameter(law, name, jnp.broadcast_to(value, (contacts,)))
     study = replace(study, law=law, free=groups)
@@ -297,17 +382,34 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
 
 
 def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
-    """Lines of a table with a row for each parameter of each fit, and the rank with all free."""
+    """Lines of a table with a row for each parameter of each fit, and the rank with all
+    free.
+    """
     rows = []
     for name, fit in fits.items():
-        data = "corrected" if name == CORRECTED else RAW
-        rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
+        if name == CORRECTED:
+            data = "corrected"
+        else:
+            data = RAW
+        if fit.experiments is not None:
+            rms = f"{fit.rms:.4f}"
+        else:
+            rms = f"{fit.rms:.4g}"
         of_fit = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
         for i, parameter in enumerate(fit.names):
-            rows.append([*of_fit[:2], parameter, _value_with_error(fit, i), *of_fit[2:]])
+            rows.append(
+                [*of_fit[:2], parameter, _value_with_error(fit, i), *of_fit[2:]]
+            )
             of_fit = [""] * 4  # in the first row only
     speeds = all(fit.experiments is not None for fit in fits.values())
-    heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
+    heads = [
+        "law",
+        "data",
+        "parameter",
+        "value",
+        "rms [m/s]" if speeds else "rms",
+        "rank",
+    ]
     lines = str(_plain_table(heads, rows)).splitlines()
     if ALL_FREE in fits:
         fit = fits[ALL_FREE]
@@ -319,8 +421,13 @@ def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
 
 def _fit_in_words(name: str, fit: "Fit") -> str:
     """Fitted values with standard errors, and the rms of the residuals, in one line."""
-    values = ", ".join(f"{x} {_value_with_error(fit, i)}" for i, x in enumerate(fit.names))
-    unit = "" if fit.experiments is None else " m/s"
+    values = ", ".join(
+        f"{x} {_value_with_error(fit, i)}" for i, x in enumerate(fit.names)
+    )
+    if fit.experiments is None:
+        unit = ""
+    else:
+        unit = " m/s"
     return f"{name}: {values}, rms {fit.rms:.4g}{unit}"
 
 
@@ -338,38 +445,54 @@ def _value_with_error(fit: "Fit", i: int) -> str:
     return f"{fit.value[i]:.5g} {spread}"
 
 
-# ---------------------------------------------------------------------------------------- compare
+# --------------------------------------------------------------------------------------
+# compare
 
 
 def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
-    """`jimpact compare`: outcomes of every law on one impact; with --fit fitted laws, too."""
+    """`jimpact compare`: outcomes of every law on one impact; with --fit fitted laws,
+    too.
+    """
     study, before, measured = _impact_of(command)
     laws, left_out = registered_laws(study.parameters)
     with waiting("comparing laws", steps.patience):
         result = ji.compare(study.scene, before, laws)
     steps(f"{len(laws)} laws compared")
     result = replace(result, left_out=left_out, measured=measured)
-    fits = _laws_fitted(study, steps) if command.fit and study.experiments is not None else None
+    if command.fit and study.experiments is not None:
+        fits = _laws_fitted(study, steps)
+    else:
+        fits = None
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     lines = [
         str(result),
         *([] if fits is None else ["", "Fitted to all shots:", str(fits), ""]),
         f"Parameters: {values}.",
-        "T+/T-: kinetic energy after over before. Time: a compiled call, with its checks.",
+        (
+            "T+/T-: kinetic energy after over before. Time: a compiled call, with its "
+            "checks."
+        ),
     ]
     data = {"velocity": before, "laws": result, "fits": fits, "left_out": left_out}
     picture = ji.plot.comparison(result, measured, study.title, study.velocities)
-    return CommandResult(_titled(study, before), data, picture, result.table, "\n".join(lines))
+    return CommandResult(
+        _titled(study, before), data, picture, result.table, "\n".join(lines)
+    )
 
 
-# ------------------------------------------------------------------------------------- montecarlo
+# --------------------------------------------------------------------------------------
+# montecarlo
 
 
 def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
-    """`jimpact montecarlo`: impacts with random gaps, velocities and parameters of the law."""
+    """`jimpact montecarlo`: impacts with random gaps, velocities and parameters of the
+    law.
+    """
     study = impact_study(command.study)
     if not study.monte_carlo:
-        raise ValueError(f"the study '{command.study}' must have a [monte_carlo] table.")
+        raise ValueError(
+            f"the study '{command.study}' must have a [monte_carlo] table."
+        )
     chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
     result = ji.monte_carlo(
         **study.monte_carlo | without_none(chosen),
@@ -382,7 +505,8 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
     return CommandResult(study.title, result, picture, result.table)
 
 
-# ------------------------------------------------------------------------------------------ chart
+# --------------------------------------------------------------------------------------
+# chart
 
 QUICK = "\nThis is the quick look; --full computes everything."
 QUICK_METHODS = ("time", "verlet", "impulse_euler")
@@ -416,33 +540,50 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
 
 
 def _lzb(study: Study) -> "ji.LZB":
-    """The study's law, or LZB with the study's values of its parameters (restitution: 1)."""
+    """The study's law, or LZB with the study's values of its parameters (restitution:
+    1).
+    """
     if isinstance(study.law, ji.LZB):
         return study.law
     values = {"restitution": 1.0} | study.parameters
-    return ji.LZB(**{key: values[key] for key in ji.REGISTRY["lzb"].parameters if key in values})
+    return ji.LZB(
+        **{key: values[key] for key in ji.REGISTRY["lzb"].parameters if key in values}
+    )
 
 
-# -------------------------------------------------------------------------------------- stability
+# --------------------------------------------------------------------------------------
+# stability
 
-MAX_STEPS = 5_000  # of a run; ten times more would only wait longer for those that do not end
-QUICK_RESOLUTION, FULL_RESOLUTION, FULL_SAMPLES = 7, 9, 300
+# of a run; ten times more would only wait longer for those that do not end
+MAX_STEPS = 5_000
+QUICK_RESOLUTION = 7
+FULL_RESOLUTION = 9
+FULL_SAMPLES = 300
 TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
 
 
 def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
-    """`jimpact stability`: map of methods over single axes; --full: over pairs of axes, too."""
+    """`jimpact stability`: map of methods over single axes; --full: over pairs of axes,
+    too.
+    """
     if not command.full:  # three balls: one program for each method
         from jimpact.methods.stability import default_axes
 
         axes = default_axes(QUICK_RESOLUTION).items()
-        size: dict[str, Any] = {"axes": {name: x for name, x in axes if name != "balls"}}
+        size: dict[str, Any] = {
+            "axes": {name: x for name, x in axes if name != "balls"}
+        }
     else:
-        size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
+        size = {
+            "resolution": FULL_RESOLUTION,
+            "slices": "pairs",
+            "samples": FULL_SAMPLES,
+        }
     result = ji.stability_map(
         command.methods or None, **size, max_steps=MAX_STEPS, progress=steps.patience
     )
-    path, pairs = command.picture(), {}
+    path = command.picture()
+    pairs = {}
     for name in result.methods if command.full else ():
         file = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
         pairs[file] = ji.plot.stability_pairs(result, name)
@@ -451,11 +592,19 @@ def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
     return CommandResult("", result, picture, result.table, text, pairs)
 
 
-# ----------------------------------------------------------------------------------------- advise
+# --------------------------------------------------------------------------------------
+# advise
 
 # that `ji.advise` takes
-_ADVISE_PARAMETERS = ("restitution", "stiffness", "exponent", "friction", "tangential_stiffness")
-_ADVISE_REFUSED = ("tangential_restitution", "initial_energy")  # these would change the outcome
+_ADVISE_PARAMETERS = (
+    "restitution",
+    "stiffness",
+    "exponent",
+    "friction",
+    "tangential_stiffness",
+)
+# these would change the outcome
+_ADVISE_REFUSED = ("tangential_restitution", "initial_energy")
 
 
 def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
@@ -476,37 +625,55 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:
-    """The study's parameters that `ji.advise` takes; a ValueError for others that matter."""
+    """The study's parameters that `ji.advise` takes; a ValueError for others that
+    matter.
+    """
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(
-            f"the study must have bistiffness contacts, but has rheology {rheology!r}: only the "
+            f"the study must have bistiffness contacts, but has rheology {rheology!r}: "
+            f"only the "
             "compliant law handles viscous contacts."
         )
     for key in _ADVISE_REFUSED:
         if np.any(study.parameters.get(key, 0.0)):
             raise ValueError(
-                f"the study must not have `{key}`, but has {study.parameters[key]}: `jimpact "
+                f"the study must not have `{key}`, but has {study.parameters[key]}: "
+                f"`jimpact "
                 "advise` compares laws without it."
             )
-    return {key: value for key, value in study.parameters.items() if key in _ADVISE_PARAMETERS}
+    return {
+        key: value
+        for key, value in study.parameters.items()
+        if key in _ADVISE_PARAMETERS
+    }
 
 
-# --------------------------------------------------------------------------------------- simulate
+# --------------------------------------------------------------------------------------
+# simulate
 
 
 def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
-    """`jimpact simulate`: a whole motion; drawn and printed as far as it goes if it fails."""
+    """`jimpact simulate`: a whole motion; drawn and printed as far as it goes if it
+    fails.
+    """
     study = motion_study(command.study)
-    system, title = study.system, study.title
+    system = study.system
+    title = study.title
     motion = jax.block_until_ready(
         study.run(t_end=command.t_end, samples=command.samples, progress=steps.patience)
     )
     steps("motion computed")
     more: dict[Path, Any] = {}
     if command.portrait is not None:
-        which = None if command.coordinate is None else command.coordinate - 1  # from 0
-        more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
+        # from 0
+        if command.coordinate is None:
+            which = None
+        else:
+            which = command.coordinate - 1
+        more[command.portrait] = ji.plot.phase_portrait(
+            motion, which, title, system=system
+        )
     if command.gif is not None:
         more[command.gif] = partial(
             ji.plot.animation,
@@ -517,9 +684,13 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
             speed=command.speed,
         )
     heads = ("time [s]", *system.body.names, *system.body.velocity_names)
-    table = _plain_table(heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist())
+    table = _plain_table(
+        heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist()
+    )
     picture = ji.plot.motion(motion, title, system=system)
-    return CommandResult(title, motion, picture, table, more=more, failure=_failure_of(motion))
+    return CommandResult(
+        title, motion, picture, table, more=more, failure=_failure_of(motion)
+    )
 
 
 def _failure_of(motion: "Motion") -> str:

@@ -1,7 +1,8 @@
 """The program `jimpact`. Heavy imports wait until a command runs.
 
-Ctrl-C ends a command at once, whatever it does: XLA cannot be interrupted by an exception while
-it compiles. The message says which steps are done and what remains on the disk.
+Ctrl-C ends a command at once, whatever it does: XLA cannot be interrupted by an
+exception while it compiles. The message says which steps are done and what remains on
+the disk.
 """
 
 import contextlib
@@ -15,12 +16,15 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-BAD_INPUT, FAILURE = 2, 1  # exit codes
+# exit codes
+BAD_INPUT = 2
+FAILURE = 1
 INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
-# Seconds of compiling from which JAX keeps a program: also single operations, which are many.
+# Seconds of compiling from which JAX keeps a program: also single operations, which are
+# many.
 LEAST_COMPILE_TIME = "0"
-# New objects until garbage is collected (Python: 700). Imports and tracing make many that live on,
-# and each collection would search them again.
+# New objects until garbage is collected (Python: 700). Imports and tracing make many
+# that live on, and each collection would search them again.
 COLLECT_EVERY = 100_000
 SHOW_CURSOR = b"\r\n\x1b[?25h"  # which a progress bar had hidden
 
@@ -56,24 +60,35 @@ class Call:
     @property
     def name(self) -> str:
         """The words that messages begin with."""
-        return "jimpact" if self.command is None else f"jimpact {self.command.name()}"
+        if self.command is None:
+            return "jimpact"
+        return f"jimpact {self.command.name()}"
 
     def interrupt_message(self) -> str:
-        """Message after ctrl-C: the steps that are done, and the results that are in files.
+        """Message after ctrl-C: the steps that are done, and the results that are in
+        files.
 
         Commands that can do so print and draw what is finished first.
         """
-        done = f" after: {'; '.join(self.steps.done)}" if self.steps and self.steps.done else ""
+        if self.steps and self.steps.done:
+            done = f" after: {'; '.join(self.steps.done)}"
+        else:
+            done = ""
         if self.steps is not None and self.steps.show_finished is not None:
             self.steps.show_finished()
             sys.stdout.flush()
             remains = "What was finished is printed and drawn."
         else:
-            remains = "" if self.command is None else self.command.remains()
+            if self.command is None:
+                remains = ""
+            else:
+                remains = self.command.remains()
         return f"{self.name}: stopped{done}. {remains}".rstrip()
 
     def warn(self, message: Any, *_: Any) -> None:
-        """Print a warning, once: a file may be read twice. It replaces `warnings.showwarning`."""
+        """Print a warning, once: a file may be read twice. It replaces
+        `warnings.showwarning`.
+        """
         if str(message) not in self.warnings:
             self.warnings.add(str(message))
             print(f"{self.name}: {message}", file=sys.stderr)
@@ -100,16 +115,19 @@ def program() -> int:
     except KeyboardInterrupt:  # where signals cannot be waited for
         print(call.interrupt_message(), file=sys.stderr)
         code = INTERRUPTED
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; the interpreter may clean up
+    # all is done; the interpreter may clean up
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     return code
 
 
 def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
-    """Run the program with `arguments` (None: those of the shell), and return the exit code.
+    """Run the program with `arguments` (None: those of the shell), and return the exit
+    code.
 
     0; wrong input 2, a method or law that fails 1, ctrl-C 130.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments is None:
+        arguments = sys.argv[1:]
     call = call or Call()
     if arguments == ["--version"]:
         from jimpact import __version__
@@ -133,7 +151,9 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
 
 
 def run_command(call: Call, arguments: list[str]) -> int:
-    """Parse the arguments, check the options, run the command, and return the exit code."""
+    """Parse the arguments, check the options, run the command, and return the exit
+    code.
+    """
     command = call.command = parse(arguments)
     command.check()
     if command.light:
@@ -142,18 +162,23 @@ def run_command(call: Call, arguments: list[str]) -> int:
     if folder is not None:
         from jimpact.tools.kept_programs import keep_programs
 
-        with contextlib.suppress(OSError):  # a folder that cannot be made: compiled anew
+        # a folder that cannot be made: compiled anew
+        with contextlib.suppress(OSError):
             keep_programs(folder)
     from jimpact.cli.commands import run
     from jimpact.tools.progress import Steps
 
     call.steps = Steps(call.name)
     failure = run(command, call.steps)
-    return call.fail(failure, FAILURE) if failure else 0
+    if failure:
+        return call.fail(failure, FAILURE)
+    return 0
 
 
 def parse(arguments: list[str]) -> Any:
-    """Options of the command that the arguments name, an object of its class in `options`."""
+    """Options of the command that the arguments name, an object of its class in
+    `options`.
+    """
     import functools
     import operator
     from typing import Annotated
@@ -164,25 +189,33 @@ def parse(arguments: list[str]) -> Any:
     from jimpact.cli.options import COMMANDS
 
     named = {x.name(): x for x in COMMANDS}
-    word, config = arguments[0], (tyro.conf.FlagCreatePairsOff,)
+    word = arguments[0]
+    config = (tyro.conf.FlagCreatePairsOff,)
     if not word.startswith("-"):  # by itself, so that messages name its own help
         check_word("the command", word, named)
-        return tyro.cli(named[word], prog=f"jimpact {word}", config=config, args=arguments[1:])
-    commands: list[Any] = [Annotated[x, tyro.conf.subcommand(name)] for name, x in named.items()]
+        return tyro.cli(
+            named[word], prog=f"jimpact {word}", config=config, args=arguments[1:]
+        )
+    commands: list[Any] = [
+        Annotated[x, tyro.conf.subcommand(name)] for name, x in named.items()
+    ]
     return tyro.cli(
         functools.reduce(operator.or_, commands),
         prog="jimpact",
         config=config,
-        description="Impact laws for several simultaneous contacts. --version: the version.",
+        description=(
+            "Impact laws for several simultaneous contacts. --version: the version."
+        ),
         args=arguments,
     )
 
 
 def cache_folder(no_cache: bool) -> str | None:
-    """The folder of compiled programs, ours and those that JAX keeps of itself; None: none.
+    """The folder of compiled programs, ours and those that JAX keeps of itself; None:
+    none.
 
-    JAX is told before it is imported; a folder that the user has set for it stays. Ours is in the
-    folder `JIMPACT_CACHE` (empty: none), else in the user's cache folder.
+    JAX is told before it is imported; a folder that the user has set for it stays. Ours
+    is in the folder `JIMPACT_CACHE` (empty: none), else in the user's cache folder.
     """
     root = os.environ.get("JIMPACT_CACHE")
     if no_cache:
@@ -196,7 +229,9 @@ def cache_folder(no_cache: bool) -> str | None:
     root = root or platformdirs.user_cache_dir("jimpact")
     folder = os.path.join(root, f"programs-{_processor()}")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_COMPILE_TIME)
+    os.environ.setdefault(
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_COMPILE_TIME
+    )
     return folder
 
 
@@ -207,16 +242,20 @@ def _processor() -> str:
 
     kind = platform.machine() + platform.processor()
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as info:
-        kind += next((line for line in info if line.startswith(("flags", "Features"))), "")
+        kind += next(
+            (line for line in info if line.startswith(("flags", "Features"))), ""
+        )
     return hashlib.sha256(kind.encode()).hexdigest()[:8]
 
 
 def end_on_interrupt(message: Callable[[], str]) -> None:
-    """From now on ctrl-C prints a message and ends the process, also within compiled code.
+    """From now on ctrl-C prints a message and ends the process, also within compiled
+    code.
 
-    A thread waits for the signal: Python's own handlers run only between two instructions of the
-    main thread, which a compiler may keep for ten seconds, and an exception raised within calls of
-    XLA is lost or fatal. Where ctrl-C was ignored it remains ignored.
+    A thread waits for the signal: Python's own handlers run only between two
+    instructions of the main thread, which a compiler may keep for ten seconds, and an
+    exception raised within calls of XLA is lost or fatal. Where ctrl-C was ignored it
+    remains ignored.
     """
     if os.name != "posix" or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         return
@@ -232,7 +271,9 @@ def end_on_interrupt(message: Callable[[], str]) -> None:
             os._exit(INTERRUPTED)
 
     def wait() -> None:
-        """Wait until the pipe delivers the number of an interrupt, then end the process."""
+        """Wait until the pipe delivers the number of an interrupt, then end the
+        process.
+        """
         while os.read(reading_end, 1)[0] != signal.SIGINT:
             pass
         end()

@@ -1,4 +1,5 @@
-"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, one class for each command.
+"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, one class for each
+command.
 
 `check` refuses options that are wrong before JAX is imported, that is at once.
 """
@@ -20,8 +21,12 @@ PICTURES = (".png", ".pdf", ".svg")
 
 
 def _option(metavar: str, constructor: Any = None) -> Any:
-    """Option of tyro: its value's name in --help, without a default, and its type if not plain."""
-    return tyro.conf.arg(metavar=metavar, constructor=constructor, help_behavior_hint="")
+    """Option of tyro: its value's name in --help, without a default, and its type if
+    not plain.
+    """
+    return tyro.conf.arg(
+        metavar=metavar, constructor=constructor, help_behavior_hint=""
+    )
 
 
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[STUDY.toml]")]
@@ -44,8 +49,8 @@ class Command:
     """Print JSON instead of text."""
     csv: Flag = False
     """Print the table as CSV instead of text."""
-    # Compile anew. Else compiled programs are stored in the user's cache folder, or in the folder
-    # that the environment variable JIMPACT_CACHE names (empty: nowhere).
+    # Compile anew. Else compiled programs are stored in the user's cache folder, or in
+    # the folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
     no_cache: Flag = False
 
     @classmethod
@@ -61,7 +66,9 @@ class Command:
     def remains(self) -> str:
         """Sentence: the files that remain of an interrupted command."""
         cached = os.environ.get("JAX_COMPILATION_CACHE_DIR") and not self.no_cache
-        return "Only compiled programs are stored." if cached else "No result is stored."
+        if cached:
+            return "Only compiled programs are stored."
+        return "No result is stored."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +76,8 @@ class DrawingCommand(Command):
     """Options of a command that draws a picture."""
 
     # Picture (.png, .pdf, .svg), or a folder for it; default: ./jimpact-<command>.png,
-    # with a study named ./jimpact-<command>-<study>.png. A message says if a file is replaced.
+    # with a study named ./jimpact-<command>-<study>.png. A message says if a file is
+    # replaced.
     out: Annotated[Path, _option("FILE", Path)] = Path()
 
     def check(self) -> None:
@@ -78,26 +86,38 @@ class DrawingCommand(Command):
         self.picture()
 
     def picture(self) -> Path:
-        """The file --out, or the command's own in the directory --out, named after the study."""
+        """The file --out, or the command's own in the directory --out, named after the
+        study.
+        """
         if self.out.suffix and not self.out.is_dir():
             return checked_file("--out", self.out, PICTURES, " or be a directory")
         named = "-".join(x for x in ("jimpact", self.name(), self.subject()) if x)
         return checked_file("--out", self.out / f"{named}.png", PICTURES)
 
     def subject(self) -> str:
-        """Name of the study, to name the file of its picture; '' for the default study."""
+        """Name of the study, to name the file of its picture; '' for the default
+        study.
+        """
         study, default = (getattr(x, "study", None) for x in (self, type(self)))
-        return "" if study is None or study == default else study.absolute().stem
+        if study is None or study == default:
+            return ""
+        return study.absolute().stem
 
 
-def checked_file(option: str, path: Path, endings: tuple[str, ...], or_else: str = "") -> Path:
-    """The path of an option, checked: one of the endings, a place where a file can be written.
+def checked_file(
+    option: str, path: Path, endings: tuple[str, ...], or_else: str = ""
+) -> Path:
+    """The path of an option, checked: one of the endings, a place where a file can be
+    written.
 
     `or_else` adds to the error of the ending another thing that the option may be.
     """
     if path.suffix not in endings:
         *others, last = endings
-        listed = f"{', '.join(others)} or {last}" if others else last
+        if others:
+            listed = f"{', '.join(others)} or {last}"
+        else:
+            listed = last
         raise ValueError(f"{option} must end in {listed}{or_else}, but is '{path}'.")
     if path.is_dir():
         raise ValueError(f"{option} must be a file, but '{path}' is a directory.")
@@ -108,14 +128,18 @@ def checked_file(option: str, path: Path, endings: tuple[str, ...], or_else: str
 
 
 def check_writable(option: str, folder: Path) -> None:
-    """Raise a ValueError if no file can be made in a folder, or above it if it is missing."""
+    """Raise a ValueError if no file can be made in a folder, or above it if it is
+    missing.
+    """
     above = next(x for x in (folder, *folder.absolute().parents) if x.exists())
     try:
         with tempfile.TemporaryFile(dir=above):
             pass
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise ValueError(f"{option} must be writable, but '{folder}' is not: {reason}.") from None
+        raise ValueError(
+            f"{option} must be writable, but '{folder}' is not: {reason}."
+        ) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,22 +149,30 @@ class ShotCommand(DrawingCommand):
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one; its [data] may be missing."""
     velocity: Annotated[tuple[float, ...], _option("V ...")] = ()
-    """Velocities before the impact [m/s, rad/s], one a coordinate; default: of a measured shot."""
+    """Velocities before the impact [m/s, rad/s], one a coordinate; default: of a
+    measured shot.
+    """
     shot: int = 1
     """Which measured shot, counted from 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FitCommand(DrawingCommand):
-    """Fit a law to measured velocities or a motion: what the study says, nothing else."""
+    """Fit a law to measured velocities or a motion: what the study says, nothing
+    else.
+    """
 
-    # Study file, its folder, or a bundled one (three_balls.toml, ball_track.toml, tossed_cube.toml,
-    # ...); also the study of a motion with [data].
+    # Study file, its folder, or a bundled one (three_balls.toml, ball_track.toml,
+    # tossed_cube.toml, ...); also the study of a motion with [data].
     study: StudyFile = Path("three_balls.toml")
     law: Name = None
-    """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
+    """Law in the place of the study's (see `jimpact laws`), or all: every law, side by
+    side.
+    """
     method: Annotated[str | None, _option("METHOD", str)] = None
-    """levenberg-marquardt (the default), adam, sgd or lbfgs, in the place of the study's."""
+    """levenberg-marquardt (the default), adam, sgd or lbfgs, in the place of the
+    study's.
+    """
     starts: Count = None
     """Number of starts; default: the study's, or 12 and more around the best."""
     seed: Count = None
@@ -176,7 +208,9 @@ class MonteCarloCommand(DrawingCommand):
     seed: Count = None
     """Seed; default: the study's, or 0."""
     executor: str = "threads"
-    """threads (one a core), serial, devices, dask (here), or the address of a Dask scheduler."""
+    """threads (one a core), serial, devices, dask (here), or the address of a Dask
+    scheduler.
+    """
     folder: Folder = None
     """Folder of finished chunks; the same command again continues from there."""
     keep_samples: Flag = False
@@ -193,7 +227,10 @@ class MonteCarloCommand(DrawingCommand):
         """Sentence: the folder of finished chunks, or that none is stored."""
         if self.folder is None:
             return "No result is stored, because --folder is not set."
-        return f"Finished chunks are in '{self.folder}': the same command continues from there."
+        return (
+            f"Finished chunks are in '{self.folder}': the same command continues "
+            f"from there."
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,7 +264,9 @@ class AdviseCommand(ShotCommand):
     tolerance: float = 1e-2
     """Model error that is allowed: energy norm of the error of v+ over that of v-."""
     stiffness_range: Annotated[tuple[float, float] | None, _option("LOW HIGH")] = None
-    """Factors by which each stiffness may be off; default: 0.1 10, or 1 1 if the study has it."""
+    """Factors by which each stiffness may be off; default: 0.1 10, or 1 1 if the study
+    has it.
+    """
     samples: int = 128
     """Draws of the unknown stiffnesses."""
     seed: int = 0
@@ -236,10 +275,12 @@ class AdviseCommand(ShotCommand):
 
 @dataclasses.dataclass(frozen=True)
 class SimulateCommand(DrawingCommand):
-    """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
+    """A whole motion: flights, impacts by any law, persistent contact, energy
+    ledger.
+    """
 
-    # Study with a [motion], its folder, or a bundled one (cradle_motion.toml, shaken_dimer.toml,
-    # rocking_block.toml, tossed_brick.toml, discs_in_a_box.toml).
+    # Study with a [motion], its folder, or a bundled one (cradle_motion.toml,
+    # shaken_dimer.toml, rocking_block.toml, tossed_brick.toml, discs_in_a_box.toml).
     study: StudyFile = Path("cradle_motion.toml")
     t_end: Annotated[float | None, _option("TIME", float)] = None
     """End of the motion [s]; default: the study's."""
@@ -265,7 +306,8 @@ class SimulateCommand(DrawingCommand):
             raise ValueError(f"--speed must be positive, but is {self.speed:g}.")
         if self.portrait == self.picture():
             raise ValueError(
-                f"--portrait and --out must be two files, but are both '{self.portrait}'."
+                f"--portrait and --out must be two files, but are both "
+                f"'{self.portrait}'."
             )
 
 
@@ -288,14 +330,27 @@ class LawsCommand(Command):
 
         if self.module is not None:
             import_laws(self.module, Path())
-        keys = ("parameters", "in_python", "summary", "right_when", "fails_when", "source")
-        rows = {name: {key: getattr(row, key) for key in keys} for name, row in REGISTRY.items()}
+        keys = (
+            "parameters",
+            "in_python",
+            "summary",
+            "right_when",
+            "fails_when",
+            "source",
+        )
+        rows = {
+            name: {key: getattr(row, key) for key in keys}
+            for name, row in REGISTRY.items()
+        }
         if self.json:
             text = json.dumps(rows, indent=2)
         elif self.bibtex:
             text = "\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values()))
         elif self.csv:
-            lines = [[x, " ".join(row.pop("parameters")), *row.values()] for x, row in rows.items()]
+            lines = [
+                [x, " ".join(row.pop("parameters")), *row.values()]
+                for x, row in rows.items()
+            ]
             text = Table([Column(key) for key in ("law", *keys)], lines).to_csv()
         else:
             text = laws_as_text(rows)
@@ -307,14 +362,19 @@ class LawsCommand(Command):
 class NewCommand:
     """Begin a study of your own: a commented study file, data, a notebook."""
 
-    kind: Annotated[Literal["fit", "compare", "montecarlo", "simulate"], tyro.conf.Positional]
+    kind: Annotated[
+        Literal["fit", "compare", "montecarlo", "simulate"], tyro.conf.Positional
+    ]
     """What the study is for."""
     folder: Annotated[Path | None, tyro.conf.Positional, _option("[DIR]")] = None
-    """Where it is written; default: ./my_<kind>. Files that exist are never replaced."""
+    """Where it is written; default: ./my_<kind>. Files that exist are never
+    replaced.
+    """
 
     like: Annotated[str | None, _option("STUDY.toml", str)] = None
-    """Bundled study to begin with (rocking_block.toml, ball_track.toml: a ball that a camera saw,
-    ...); default: three balls, or a cradle."""
+    """Bundled study to begin with (rocking_block.toml, ball_track.toml: a ball that a
+    camera saw, ...); default: three balls, or a cradle.
+    """
 
     light: ClassVar[bool] = True
 
@@ -331,7 +391,9 @@ class NewCommand:
         return ""
 
     def run(self) -> int:
-        """Write the files of a new study, and print their names and the next command."""
+        """Write the files of a new study, and print their names and the next
+        command.
+        """
         from jimpact.cli.starting import begin
 
         folder = self.folder or Path(f"my_{self.kind}")

@@ -12,13 +12,16 @@ from jimpact.cli.study_file import STUDY, located
 
 WIDEST = 100  # characters; longer lines of prose are hard to read
 TEMPLATES = Path(__file__).with_name("new_studies.toml")
-FILES = {"data": "shots.csv", "track": "track.csv"}  # of the tables of a study that name one
+# of the tables of a study that name one
+FILES = {"data": "shots.csv", "track": "track.csv"}
 
 
 def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
-    """Write a study, its data and a notebook into a folder; returns the paths of the files.
+    """Write a study, its data and a notebook into a folder; returns the paths of the
+    files.
 
-    `kind` is the command that they are for, `like` the bundled study to copy (None: its default).
+    `kind` is the command that they are for, `like` the bundled study to copy (None: its
+    default).
 
     Raises:
         FileNotFoundError: there is no such study. ValueError: a file exists already.
@@ -64,11 +67,15 @@ def _notebook(title: str, sources: list[str]) -> str:
 
 
 def laws_as_text(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Text on laws one below the other, in lines that fit the terminal, from rows by name."""
+    """Text on laws one below the other, in lines that fit the terminal, from rows by
+    name.
+    """
     width = min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
     lines = []
     for name, row in rows.items():
-        lines += textwrap.wrap(f"{name}: {row['summary']}", width, subsequent_indent=" " * 14)
+        lines += textwrap.wrap(
+            f"{name}: {row['summary']}", width, subsequent_indent=" " * 14
+        )
         friction = "friction" in row["parameters"]
         entries = {
             "parameters": ", ".join(row["parameters"]),

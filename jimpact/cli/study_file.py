@@ -1,4 +1,6 @@
-"""Common parts of studies of impacts and of motions: file, keys of its tables, law and body."""
+"""Common parts of studies of impacts and of motions: file, keys of its tables, law and
+body.
+"""
 
 import dataclasses
 import importlib.util
@@ -23,16 +25,21 @@ from jimpact.tools.checks import check_word, suggestion
 from jimpact.tools.study_tables import check_keys, check_kind
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
-NO_DATA = "a study must have shots to be fitted, of [data], [track] or [bounces], but has none."
+NO_DATA = (
+    "a study must have shots to be fitted, of [data], [track] or [bounces], but "
+    "has none."
+)
 
-# -------------------------------------------------------------------------- locating and reading
+# -------------------------------------------------------------------------- locating
+# and reading
 
 
 def located(path: Path, table: str) -> Path:
-    """Path of a study: the file, `study.toml` in the folder, or the bundled study of this name.
+    """Path of a study: the file, `study.toml` in the folder, or the bundled study of
+    this name.
 
-    `table` is the head of a table: if there is no such study, the error lists the bundled studies
-    that have it.
+    `table` is the head of a table: if there is no such study, the error lists the
+    bundled studies that have it.
     """
     if path.is_file():
         return path
@@ -43,7 +50,8 @@ def located(path: Path, table: str) -> Path:
         return bundled / path
     if path.is_dir():
         raise FileNotFoundError(
-            f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes one)."
+            f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes "
+            f"one)."
         )
     tables = sorted(bundled.glob("*.toml"))
     choices = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
@@ -60,10 +68,13 @@ def read_tables(path: Path) -> dict[str, Any]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         if path.suffix == ".csv":
             raise ValueError(
-                "a study must be a TOML file, but this is a CSV file. `jimpact new fit my_fit` "
+                "a study must be a TOML file, but this is a CSV file. `jimpact new fit "
+                "my_fit` "
                 "writes a study; name this file under [data] in it."
             ) from None
-        raise ValueError(f"the study must be a TOML file: {_position(error)}.") from None
+        raise ValueError(
+            f"the study must be a TOML file: {_position(error)}."
+        ) from None
 
 
 def _position(error: Exception) -> str:
@@ -75,20 +86,27 @@ def _position(error: Exception) -> str:
     """
     reason, _, place = str(error).rstrip(")").partition(" (at ")
     reason = reason[:1].lower() + reason[1:]
-    return f"{place}: {reason}" if place else reason
+    if place:
+        return f"{place}: {reason}"
+    return reason
 
 
-# ------------------------------------------------------------------------------------------- keys
+# --------------------------------------------------------------------------------------
+# keys
 
 
 def check_tables(
     study: Mapping[str, Any], required: tuple[str, ...], others: tuple[str, ...]
 ) -> None:
-    """Raise a ValueError unless a study has the `required` tables, and besides only `others`.
+    """Raise a ValueError unless a study has the `required` tables, and besides only
+    `others`.
 
     A title is allowed, too.
     """
-    for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
+    for scene, system, kind in (
+        ("scene", "system", "a motion"),
+        ("system", "scene", "one impact"),
+    ):
         if system in required and system not in study and scene in study:
             raise ValueError(
                 f"the study must be of {kind}, with [{system}], but has [{scene}]: "
@@ -100,9 +118,11 @@ def check_tables(
             raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")
 
 
-# ------------------------------------------------------------------------- tables of every study
+# ------------------------------------------------------------------------- tables of
+# every study
 
-# Keys of [fit], all of which are arguments of `fit` or `Search`; `method` is of impacts only.
+# Keys of [fit], all of which are arguments of `fit` or `Search`; `method` is of impacts
+# only.
 FIT = ("free", "method", "loss", "starts", "seed", "max_steps", "profiles")
 
 
@@ -116,18 +136,23 @@ class Fitted(NamedTuple):
 
 
 def law_of(
-    tables: Mapping[str, Any], other_law: str | None, folder: Path, scene: Scene | None = None
+    tables: Mapping[str, Any],
+    other_law: str | None,
+    folder: Path,
+    scene: Scene | None = None,
 ) -> tuple[Law, dict[str, Any], Fitted]:
-    """Law of a study, values of its parameters, and statements on its fit, from checked tables.
+    """Law of a study, values of its parameters, and statements on its fit, from checked
+    tables.
 
     The tables are [law], [law.bounds], [law.priors] and [fit].
 
     Args:
         tables: of the study.
-        other_law: name of a law in the place of the study's; values that it does not take are left
-            out.
+        other_law: name of a law in the place of the study's; values that it does not
+            take are left out.
         folder: of the study, in which a module may lie that registers its law.
-        scene: for a `RestitutionMatrix` without its matrix, which starts from an admissible one.
+        scene: for a `RestitutionMatrix` without its matrix, which starts from an
+            admissible one.
     """
     table = tables["law"]
     check_keys("[law]", table, tuple(table), required=("name",))
@@ -143,7 +168,10 @@ def law_of(
     allowed = (*REGISTRY[study_law].parameters, *not_of_law)
     for key in ("bounds", "priors"):
         pairs = table.get(key, {})
-        fields = {entry_of(x)[0]: x for x in pairs} if isinstance(pairs, dict) else pairs
+        if isinstance(pairs, dict):
+            fields = {entry_of(x)[0]: x for x in pairs}
+        else:
+            fields = pairs
         check_keys(f"[law.{key}]", fields, allowed)
     row = REGISTRY[name]
     values = {key: x for key, x in table.items() if key in row.arguments}
@@ -157,33 +185,47 @@ def law_of(
     def kept(pairs: Mapping[str, Any]) -> dict[str, Any]:
         """The pairs whose parameter the law has; all if it is the study's own."""
         fields = (*row.parameters, *not_of_law)
-        return {x: y for x, y in pairs.items() if other_law is None or entry_of(x)[0] in fields}
+        return {
+            x: y
+            for x, y in pairs.items()
+            if other_law is None or entry_of(x)[0] in fields
+        }
 
-    law, free = row.build(**values), kept(free)
+    law = row.build(**values)
+    free = kept(free)
     own = {x: choice for x, choice in free.items() if entry_of(x)[0] not in not_of_law}
     if own:  # refuse what this law does not have, whether or not it will be fitted
         free_parameters(law, own, absolute=True)
-    bounds, priors = kept(table.get("bounds", {})), kept(table.get("priors", {}))
+    bounds = kept(table.get("bounds", {}))
+    priors = kept(table.get("priors", {}))
     return law, values, Fitted(free, bounds, priors, options)
 
 
 def _masks(free: Any) -> dict[str, Any]:
-    """Free parameters by name: True, or a mask over contacts; `free` is a list or such a table."""
+    """Free parameters by name: True, or a mask over contacts; `free` is a list or such
+    a table.
+    """
     if isinstance(free, dict):
         return free
     if isinstance(free, list) and all(isinstance(name, str) for name in free):
         return dict.fromkeys(free, True)
-    raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
+    raise ValueError(
+        f"`free` must be a list of names or a table of masks, but is {free!r}."
+    )
 
 
 def _with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
-    """A law's values with the exponent as an array if it is free, else as numbers: faster."""
+    """A law's values with the exponent as an array if it is free, else as numbers:
+    faster.
+    """
     if "exponent" not in values:
         return values
     exponent = values["exponent"]
     if "exponent" in free:
         return values | {"exponent": np.asarray(exponent, float)}
-    return values | {"exponent": tuple(exponent) if isinstance(exponent, list) else exponent}
+    return values | {
+        "exponent": tuple(exponent) if isinstance(exponent, list) else exponent
+    }
 
 
 def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,7 +234,8 @@ def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
-    """Arguments of `fit` from the options of a study: `starts`, `profiles`, and `search`.
+    """Arguments of `fit` from the options of a study: `starts`, `profiles`, and
+    `search`.
 
     All other options replace entries of `search`.
     """
@@ -203,25 +246,31 @@ def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
 
 
 def import_laws(module: str, folder: Path) -> None:
-    """Import a module that registers laws: a file (.py, relative to the folder), or by its name."""
+    """Import a module that registers laws: a file (.py, relative to the folder), or by
+    its name.
+    """
     if not module.endswith(".py"):
         importlib.import_module(module)
         return
     path = (folder / module).resolve()
     if not path.is_file():
         raise ValueError(
-            f"`module` must be a file or an importable module, but '{path}' does not exist."
+            f"`module` must be a file or an importable module, but '{path}' does not "
+            f"exist."
         )
     imported = sys.modules.get(path.stem)
     if imported is not None:
         if Path(getattr(imported, "__file__", None) or "").resolve() == path:
             return
-        raise ValueError(f"`module` must have a new name, but another '{path.stem}' is imported.")
+        raise ValueError(
+            f"`module` must have a new name, but another '{path.stem}' is imported."
+        )
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
     loaded = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = loaded  # before it runs: classes are looked up there by name
+    # before it runs: classes are looked up there by name
+    sys.modules[path.stem] = loaded
     try:
         spec.loader.exec_module(loaded)
     except BaseException:

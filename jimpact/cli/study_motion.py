@@ -1,4 +1,6 @@
-"""Studies of motions: system, base, law, initial state and data, of a checked TOML file."""
+"""Studies of motions: system, base, law, initial state and data, of a checked TOML
+file.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -45,14 +47,19 @@ class MotionStudy:
     options: dict[str, Any] = field(default_factory=dict)
 
     def fit(self, **options: Any) -> Fit:
-        """`fit_motion` with the study's options, or with those that are passed and not None."""
+        """`fit_motion` with the study's options, or with those that are passed and not
+        None.
+        """
         if self.measured is None:
-            raise ValueError("a study of a motion must have a [data] table to be fitted.")
+            raise ValueError(
+                "a study of a motion must have a [data] table to be fitted."
+            )
         start, _ = self.arguments["t_end"]
         times, q, sigma = self.measured
         if abs(times[0] - start) > UNEVEN_STEPS * (times[1] - times[0]):
             raise ValueError(
-                f"`t` in [data] must begin at {start:g} s, but begins at {times[0]:g} s."
+                f"`t` in [data] must begin at {start:g} s, but begins at {times[0]:g} "
+                f"s."
             )
         arguments = {key: x for key, x in self.arguments.items() if key != "samples"}
         arguments["t_end"] = start, float(times[-1])
@@ -61,19 +68,28 @@ class MotionStudy:
         return fit_motion(self.system, self.law, q, sigma=sigma, **arguments)
 
     def run(
-        self, t_end: float | None = None, samples: int | None = None, progress: float | None = None
+        self,
+        t_end: float | None = None,
+        samples: int | None = None,
+        progress: float | None = None,
     ) -> Motion:
-        """`simulate` with the study's arguments, or with those that are passed and not None."""
+        """`simulate` with the study's arguments, or with those that are passed and not
+        None.
+        """
         start, end = self.arguments["t_end"]
         changes = {
             "t_end": (start, end if t_end is None else t_end),
             "samples": samples,
             "method": replace(self.arguments["method"], progress=progress),
         }
-        return simulate(self.system, self.law, **(self.arguments | without_none(changes)))
+        return simulate(
+            self.system, self.law, **(self.arguments | without_none(changes))
+        )
 
 
-def motion_study_of(tables: Mapping[str, Any], path: Path, law_name: str | None) -> MotionStudy:
+def motion_study_of(
+    tables: Mapping[str, Any], path: Path, law_name: str | None
+) -> MotionStudy:
     """Study of a motion from the tables of the file `path`, checked.
 
     `law_name`: a law in the place of the study's, None: its own.
@@ -96,7 +112,9 @@ def motion_study_of(tables: Mapping[str, Any], path: Path, law_name: str | None)
 
 
 def _measured(table: Mapping[str, Any], study: Path) -> Positions:
-    """Times, positions and their errors in the file of the table [data]; `study`: path of it."""
+    """Times, positions and their errors in the file of the table [data]; `study`: path
+    of it.
+    """
     check_keys("[data]", table, ("file",), ("file",))
     check_kind("[data]", "file", table["file"], str, "a path")
     return read_positions(study.parent / table["file"])

@@ -1,4 +1,6 @@
-"""Consistency of an outcome: kinematic, kinetic and energetic, and the momentum balance."""
+"""Consistency of an outcome: kinematic, kinetic and energetic, and the momentum
+balance.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +30,7 @@ CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
 
 
 class Audit(eqx.Module):
-    """Four conditions on an outcome, and the numbers behind them, scaled by the impact's size.
+    """Four conditions on an outcome, and their numbers over the impact's size.
 
     Attributes:
         kinematic: whether gamma+ >= 0 at closed contacts ().
@@ -38,7 +40,8 @@ class Audit(eqx.Module):
         worst_gap_velocity: the least gamma+ ().
         worst_impulse: the least p ().
         energy_gain: T+ - T- less what was stored ().
-        momentum_residual: largest entry of M (v+ - v-) - N p - H p_t, over that of M v- ().
+        momentum_residual: largest entry of M (v+ - v-) - N p - H p_t, over that of M v-
+            ().
     """
 
     kinematic: jax.Array
@@ -66,8 +69,8 @@ def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
     """Check an outcome against what every impact must satisfy, whatever the law.
 
     Equation: closed contacts `gamma+ >= 0` (kinematic), `p >= 0` (kinetic),
-    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p + H p_t` (momentum), but for reactions of
-    bilateral constraints.
+    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p + H p_t` (momentum), but for
+    reactions of bilateral constraints.
 
     Args:
         out: what `impact` returned, or an `Impact` filled by hand from measurements.
@@ -75,11 +78,12 @@ def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
         velocity: v- (n,) [m/s].
 
     Returns:
-        `Audit`: a boolean () for each of the four, `consistent` for all; `print` says it in words.
+        `Audit`: a boolean () for each of the four, `consistent` for all; `print` says
+            it in words.
 
     Raises:
-        ValueError: the number of velocities is not that of coordinates. TypeError: arguments in
-            another order.
+        ValueError: the number of velocities is not that of coordinates. TypeError:
+            arguments in another order.
 
     Source: Brogliato (2016), section 6.2.4.
 
@@ -98,11 +102,13 @@ def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
     size = jnp.sqrt(approach + 2 * out.initial_energy)  # scale of the impact [sqrt(J)]
     size = jnp.where(size > 0, size, 1.0)
     momentum_change = momentum(scene, out.velocity - v)
-    change = 0.5 * momentum_change @ (out.velocity + v)  # T+ - T- without their cancellation
+    # T+ - T- without their cancellation
+    change = 0.5 * momentum_change @ (out.velocity + v)
     residual = momentum_change - scene.normals @ out.impulse
     if scene.tangents is not None:
         residual = residual - scene.tangents @ out.tangential_impulse
-    if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
+    # reactions of the constraints are not listed in `out`
+    if scene.constraints is not None:
         basis = jnp.linalg.qr(scene.constraints)[0]
         residual = residual - basis @ (basis.T @ residual)
     # as `impact` judges: an approach within rounding is not the law's
@@ -112,7 +118,9 @@ def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
     worst_gap_velocity = jnp.min(least) / size
     worst_impulse = jnp.min(out.impulse * root) / size
     gain = (change - out.initial_energy) / size**2
-    off = jnp.abs(residual).max() / jnp.maximum(jnp.abs(momentum(scene, v)).max(), 1e-300)
+    off = jnp.abs(residual).max() / jnp.maximum(
+        jnp.abs(momentum(scene, v)).max(), 1e-300
+    )
     tolerance = judged_beyond(out.velocity.dtype, jnp.asarray(out.accuracy))
     return Audit(
         kinematic=worst_gap_velocity >= -tolerance,
@@ -127,17 +135,23 @@ def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
 
 
 def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
-    """A sentence for summaries if no contact approaches, so that no impact happens; else None."""
+    """A sentence for summaries if no contact approaches, so that no impact happens;
+    else None.
+    """
     contact = contact_of(scene, as_velocity(scene, velocity), uses_gaps=True)
     approaches = np.asarray(contact.gap_velocity < 0)
     if (approaches & np.asarray(scene.closed)).any():
         return None
     if approaches.any():
         return (
-            "no closed contact approaches (gamma- < 0), only open ones do: laws that use gaps are "
+            "no closed contact approaches (gamma- < 0), only open ones do: laws that "
+            "use gaps are "
             "Compliant and Binary"
         )
-    return "nothing approaches (gamma- < 0 at no contact): is the sign of the velocities as meant?"
+    return (
+        "nothing approaches (gamma- < 0 at no contact): is the sign of the "
+        "velocities as meant?"
+    )
 
 
 @full_precision
@@ -151,7 +165,8 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         names: of the velocities with their units (n,), as `body.velocity_names`.
 
     Returns:
-        Text of several lines: status, energy, audit, velocities and impulses of all contacts.
+        Text of several lines: status, energy, audit, velocities and impulses of all
+            contacts.
 
     Raises:
         ValueError: not one velocity, or name, per coordinate.
@@ -173,9 +188,14 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     row = STATUS[int(codes)]
     before = float(kinetic_energy(scene, velocity))
     change = float(out.energy_change)
-    remaining = (before + change) / before if before else float("nan")
+    if before:
+        remaining = (before + change) / before
+    else:
+        remaining = float("nan")
     broken = audit(out, scene, velocity).broken
-    words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
+    words = [
+        f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES
+    ]
     reason = nothing_approaches(scene, velocity)
     nothing_happens = reason is not None and not np.asarray(out.impulse).any()
     lines = [
@@ -192,13 +212,18 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         numbers = f"{formatted(a, '14.6g')} {formatted(b, '14.6g')}"
         lines.append(f"{i + 1:10d} {numbers}{f'   {names[i]}' if names else ''}")
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
-    gamma, gamma_plus = (
-        np.asarray(gap_velocity(scene, velocity)),
-        np.asarray(gap_velocity(scene, out.velocity)),
-    )
+    gamma = np.asarray(gap_velocity(scene, velocity))
+    gamma_plus = np.asarray(gap_velocity(scene, out.velocity))
     contacts = zip(gamma, gamma_plus, np.asarray(out.impulse), scene.closed)
     for j, (a, b, p, closed) in enumerate(contacts):
-        note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
-        numbers = f"{formatted(a, '15.6g')} {formatted(b, '14.6g')} {formatted(p, '21.6g')}"
+        if closed:
+            note = ""
+        elif p == 0:
+            note = "   open: takes no part"
+        else:
+            note = "   open before"
+        numbers = (
+            f"{formatted(a, '15.6g')} {formatted(b, '14.6g')} {formatted(p, '21.6g')}"
+        )
         lines.append(f"{j + 1:7d} {numbers}{note}")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """Contact space: the arguments of an impact law, and the groups of coupled contacts.
 
-A scene of n coordinates and m contacts is reduced to W, gamma- and, where it has tangents, the
-tangential rows: everything that an impact law may depend on.
+A scene of n coordinates and m contacts is reduced to W, gamma- and, where it has
+tangents, the tangential rows: everything that an impact law may depend on.
 """
 
 import dataclasses
@@ -29,41 +29,45 @@ from jimpact.tools.checks import as_float_array, is_traced
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision, without_rounding
 
-# Groups of unequal size are padded to the largest of them, because compiling another program takes
-# longer than many impacts. A second program for the smaller groups must save this factor of the
-# entries of W. Ten times more: one large group would make every small one as expensive.
+# Groups of unequal size are padded to the largest of them, because compiling another
+# program takes longer than many impacts. A second program for the smaller groups must
+# save this factor of the entries of W. Ten times more: one large group would make every
+# small one as expensive.
 WORTH_A_PROGRAM = 4
 
-# Contact indices (count, size), one array for each program. A smaller group is padded by m plus the
-# index of its first contact, so that the padding has the group's scale of stored energy. The
-# indices are data, not structure: scenes whose groups differ only in their members share the
-# compiled impact.
+# Contact indices (count, size), one array for each program. A smaller group is padded
+# by m plus the index of its first contact, so that the padding has the group's scale of
+# stored energy. The indices are data, not structure: scenes whose groups differ only in
+# their members share the compiled impact.
 Groups = tuple[np.ndarray, ...]
 
 
 class Contact(eqx.Module):
     """All that a law may depend on in an impact, with derived quantities.
 
-    Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`, with normals N,
-    tangents H, W = N^T M^-1 N, W_nt = N^T M^-1 H = W_tn^T, W_tt = H^T M^-1 H, slip velocities
+    Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`, with
+    normals N, tangents H, W = N^T M^-1 N, W_nt = N^T M^-1 H = W_tn^T, W_tt = H^T M^-1
+    H, slip velocities
     u = H^T v, normal impulses p and tangential impulses p_t.
 
-    Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no stored
-    energy), unless the law uses gaps, and so are contacts that bilateral constraints hold; gap
-    velocities within `noise` are 0. `impact` always calls `impulses`. If no contact approaches or
-    stores energy, it passes gamma- = -1 and discards the result, so that gradients stay finite.
+    Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no
+    stored energy), unless the law uses gaps, and so are contacts that bilateral
+    constraints hold; gap velocities within `noise` are 0. `impact` always calls
+    `impulses`. If no contact approaches or stores energy, it passes gamma- = -1 and
+    discards the result, so that gradients stay finite.
 
     Args:
         delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain) or `Sparse` (a packing).
         gap_velocity: gamma- (m,) [m/s], < 0 on approach.
         closed: (m,) contacts without a gap; None: all.
         gaps: (m,) [m]; None: 0.
-        stored: energy (m,) [J] in the contacts before the impact (precompression); None: 0.
-        norm: (m,) sqrt(grad f_j^T M^-1 grad f_j), f_j the gap function, ignoring bilateral
-            constraints; None: sqrt(W_jj), equal if there are none.
+        stored: energy (m,) [J] in the contacts before the impact (precompression);
+            None: 0.
+        norm: (m,) sqrt(grad f_j^T M^-1 grad f_j), f_j the gap function, ignoring
+            bilateral constraints; None: sqrt(W_jj), equal if there are none.
         noise: (m,) [m/s] uncertainty of gamma- by the rounding of v-; None: 0.
-        tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without tangents; t = m
-            in the plane, 2 m in space, contact by contact.
+        tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without
+            tangents; t = m in the plane, 2 m in space, contact by contact.
         rtol: tolerance () for laws that have none of their own; None: their default.
 
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
@@ -97,16 +101,36 @@ class Contact(eqx.Module):
         tangential_block: Any = None,
         rtol: Any = None,
     ):
-        """Set the fields, arrays of floats; what is None becomes its default, see the class."""
+        """Set the fields, arrays of floats; what is None becomes its default, see the
+        class.
+        """
         structured = isinstance(delassus, (Tridiagonal, Sparse))
-        self.delassus = delassus if structured else as_float_array("delassus", delassus)
+        if structured:
+            self.delassus = delassus
+        else:
+            self.delassus = as_float_array("delassus", delassus)
         self.gap_velocity = as_float_array("gap_velocity", gap_velocity)
         zero = jnp.zeros_like(self.gap_velocity)
-        self.closed = zero == 0 if closed is None else jnp.asarray(closed, bool)
-        self.gaps = zero if gaps is None else gaps
-        self.stored = zero if stored is None else stored
-        self.norm = jnp.sqrt(diagonal(self.delassus)) if norm is None else norm
-        self.noise = zero if noise is None else noise
+        if closed is None:
+            self.closed = zero == 0
+        else:
+            self.closed = jnp.asarray(closed, bool)
+        if gaps is None:
+            self.gaps = zero
+        else:
+            self.gaps = gaps
+        if stored is None:
+            self.stored = zero
+        else:
+            self.stored = stored
+        if norm is None:
+            self.norm = jnp.sqrt(diagonal(self.delassus))
+        else:
+            self.norm = norm
+        if noise is None:
+            self.noise = zero
+        else:
+            self.noise = noise
         self.tangential_block = None
         if tangential_block is not None:
             self.tangential_block = TangentialBlock(*map(jnp.asarray, tangential_block))
@@ -120,22 +144,30 @@ class Contact(eqx.Module):
     @property
     def tangents(self) -> int:
         """Tangents of each contact: 0, 1 (planar) or 2."""
-        return 0 if self.slip is None else self.slip.shape[0] // self.contacts
+        if self.slip is None:
+            return 0
+        return self.slip.shape[0] // self.contacts
 
     @property
     def cross(self) -> jax.Array | None:
         """W_nt (m, t) [1/kg]; None without tangents."""
-        return None if self.tangential_block is None else self.tangential_block.normal_tangent
+        if self.tangential_block is None:
+            return None
+        return self.tangential_block.normal_tangent
 
     @property
     def tangential(self) -> jax.Array | None:
         """W_tt (t, t) [1/kg]; None without tangents."""
-        return None if self.tangential_block is None else self.tangential_block.tangent
+        if self.tangential_block is None:
+            return None
+        return self.tangential_block.tangent
 
     @property
     def slip(self) -> jax.Array | None:
         """u- (t,) [m/s]; None without tangents."""
-        return None if self.tangential_block is None else self.tangential_block.slip
+        if self.tangential_block is None:
+            return None
+        return self.tangential_block.slip
 
     @property
     def structure(self) -> Structure:
@@ -168,19 +200,29 @@ class Contact(eqx.Module):
 
     @property
     def size(self) -> jax.Array:
-        """Energy scale () [sqrt(J)]: root of twice the energy of approach plus the stored one."""
+        """Energy scale () [sqrt(J)]: root of twice the energy of approach plus the
+        stored one.
+        """
         root = jnp.sqrt(diagonal(self.delassus))
         approach = jnp.sum((jnp.minimum(self.gap_velocity, 0.0) / root) ** 2)
         return jnp.sqrt(approach + 2 * jnp.sum(self.stored))
 
     @property
     def happens(self) -> jax.Array:
-        """True () if there is an impact: a contact approaches, stores energy or is not finite."""
+        """True () if there is an impact: a contact approaches, stores energy or is not
+        finite.
+        """
         gamma = self.gap_velocity
-        return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
+        return (
+            jnp.any(gamma < 0)
+            | jnp.any(self.stored > 0)
+            | ~jnp.all(jnp.isfinite(gamma))
+        )
 
     def within(self, noise: jax.Array) -> "Contact":
-        """The contact with gap velocities up to `noise` () [m/s] set to 0, as within rounding."""
+        """The contact with gap velocities up to `noise` () [m/s] set to 0, as within
+        rounding.
+        """
         gamma = without_rounding(self.gap_velocity, noise)
         return eqx.tree_at(
             lambda contact: (contact.gap_velocity, contact.noise),
@@ -190,16 +232,25 @@ class Contact(eqx.Module):
 
     def approaching(self, speed: jax.Array) -> "Contact":
         """The contact with all gap velocities lower by `speed` () [m/s]."""
-        return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
+        return eqx.tree_at(
+            lambda contact: contact.gap_velocity, self, self.gap_velocity - speed
+        )
 
     def integrated_to(self, rtol: jax.Array) -> "Contact":
-        """The contact whose laws integrate to `rtol` () where they have none of their own."""
+        """The contact whose laws integrate to `rtol` () where they have none of their
+        own.
+        """
         each = jnp.broadcast_to(rtol, self.gap_velocity.shape[:-1])
-        return eqx.tree_at(lambda contact: contact.rtol, self, each, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            lambda contact: contact.rtol, self, each, is_leaf=lambda x: x is None
+        )
 
     @full_precision
-    def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
-        """gamma+ (m,) [m/s] after impulses, `normal` p (m,) and `tangential` p_t (t,) [N s].
+    def gap_velocity_after(
+        self, normal: jax.Array, tangential: jax.Array | None
+    ) -> jax.Array:
+        """gamma+ (m,) [m/s] after impulses, `normal` p (m,) and `tangential` p_t (t,)
+        [N s].
 
         Equation: `gamma+ = gamma- + W p + W_nt p_t`.
         """
@@ -210,7 +261,8 @@ class Contact(eqx.Module):
 
     @full_precision
     def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
-        """u+ (t,) [m/s] after impulses, `normal` p (m,) and `tangential` p_t (t,) [N s].
+        """u+ (t,) [m/s] after impulses, `normal` p (m,) and `tangential` p_t (t,) [N
+        s].
 
         Equation: `u+ = u- + W_tn p + W_tt p_t`; only where there are tangents.
         """
@@ -219,15 +271,21 @@ class Contact(eqx.Module):
         return slip + cross.T @ normal + tangent @ tangential
 
     @full_precision
-    def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
-        """T+ - T- () [J], the work of impulses, `normal` p (m,) and `tangential` p_t (t,) [N s].
+    def energy_change(
+        self, normal: jax.Array, tangential: jax.Array | None = None
+    ) -> jax.Array:
+        """T+ - T- () [J], the work of impulses, `normal` p (m,) and `tangential` p_t
+        (t,) [N s].
 
         Equation: `(gamma- + gamma+) . p / 2 + (u- + u+) . p_t / 2`.
         """
         mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
         if tangential is None or self.slip is None:
             return mean @ normal
-        return mean @ normal + 0.5 * (self.slip + self.slip_after(normal, tangential)) @ tangential
+        return (
+            mean @ normal
+            + 0.5 * (self.slip + self.slip_after(normal, tangential)) @ tangential
+        )
 
     @property
     def kinetic_angles(self) -> jax.Array:
@@ -236,10 +294,11 @@ class Contact(eqx.Module):
 
     @full_precision
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
-        """Rounding (m,) [m/s] of gamma+ after `normal` p (m,) and `tangential` p_t (t,) [N s].
+        """Rounding (m,) [m/s] of gamma+ after `normal` p (m,) and `tangential` p_t (t,)
+        [N s].
 
-        Equation: `noise + eps (|gamma-| + |W| |p| + |W_nt| |p_t|)`, eps that of one sum; terms of
-        W p may cancel, their rounding remains.
+        Equation: `noise + eps (|gamma-| + |W| |p| + |W_nt| |p_t|)`, eps that of one
+        sum; terms of W p may cancel, their rounding remains.
         """
         w = self.delassus
         size: jax.Array = abs(w) @ jnp.abs(normal)  # type: ignore[operator]
@@ -251,30 +310,40 @@ class Contact(eqx.Module):
 
 @full_precision
 def contact_of(
-    scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
+    scene: Scene,
+    velocity: jax.Array,
+    stored: jax.Array | None = None,
+    uses_gaps: bool = False,
 ) -> Contact:
     """The contacts of a scene at a velocity v- (n,) [m/s].
 
     Equation: `W = N^T M^-1 N`, `gamma- = N^T v-`; with tangents `W_nt = N^T M^-1 H`,
     `W_tt = H^T M^-1 H`, `u- = H^T v-`.
 
-    `stored` is the energy in the contacts, () or (m,) [J]; None: 0. With `uses_gaps` open contacts
-    take part, but those with an infinite gap never do.
+    `stored` is the energy in the contacts, () or (m,) [J]; None: 0. With `uses_gaps`
+    open contacts take part, but those with an infinite gap never do.
     """
     gamma, noise = rounded_gap_velocity(scene, velocity)
-    w, block = delassus_matrix(scene), None
+    w = delassus_matrix(scene)
+    block = None
     if scene.tangents is not None:
         moved = solve_mass(scene, scene.tangents)
-        cross, tangent = scene.normals.T @ moved, scene.tangents.T @ moved
+        cross = scene.normals.T @ moved
+        tangent = scene.tangents.T @ moved
         block = TangentialBlock(cross, tangent, scene.tangents.T @ velocity)
-    stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, gamma.shape)
+    if stored is None:
+        stored = jnp.zeros_like(gamma)
+    else:
+        stored = jnp.broadcast_to(stored, gamma.shape)
     contact = Contact(
         w,
         gamma,
         closed=scene.closed,
         gaps=scene.gaps,
         stored=jnp.where(scene.closed, stored, 0.0).astype(gamma.dtype),
-        norm=jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene),
+        norm=jnp.sqrt(diagonal(w))
+        if scene.constraints is None
+        else kinetic_norm(scene),
         noise=noise,
         tangential_block=block,
     )
@@ -287,13 +356,16 @@ def contact_of(
 
 @full_precision
 def held_by_constraints(scene: Scene) -> jax.Array:
-    """True (m,) for contacts whose normal is a combination of bilateral constraints: they are held.
+    """True (m,) for contacts whose normal is a combination of bilateral constraints:
+    they are held.
 
     Equation: `r^T M^-1 r` is rounding beside `N_j^T M^-1 N_j`, of the residual
-    `r = N_j - h (h^T M^-1 h)^-1 h^T M^-1 N_j`, the part of the normal that no reactions of the
-    constraints h balance. (W_jj, a small difference of large numbers, does not show it.)
+    `r = N_j - h (h^T M^-1 h)^-1 h^T M^-1 N_j`, the part of the normal that no reactions
+    of the constraints h balance. (W_jj, a small difference of large numbers, does not
+    show it.)
     """
-    free, h = without_constraints(scene), scene.constraints
+    free = without_constraints(scene)
+    h = scene.constraints
     assert h is not None  # asked only of scenes with constraints
     m_inv_h = solve_mass(free, h)
     reactions = solve_definite(h.T @ m_inv_h, m_inv_h.T @ scene.normals)
@@ -305,17 +377,21 @@ def held_by_constraints(scene: Scene) -> jax.Array:
 def _without_held(contact: Contact, held: jax.Array) -> Contact:
     """The contacts where those `held` (m,) by constraints take no part, as if open.
 
-    Their diagonal entry of W becomes that of the bodies without constraints, |grad f_j|^2.
+    Their diagonal entry of W becomes that of the bodies without constraints, |grad
+    f_j|^2.
     """
     own = jnp.diag(jnp.where(held, contact.norm**2, diagonal(contact.delassus)))
     w = jnp.where(jnp.eye(held.shape[0], dtype=bool), own, contact.normal_delassus)
-    closed, stored = contact.closed & ~held, jnp.where(held, 0.0, contact.stored)
+    closed = contact.closed & ~held
+    stored = jnp.where(held, 0.0, contact.stored)
     contact = dataclasses.replace(contact, delassus=w, closed=closed, stored=stored)
     return _taking_part(contact, ~held)
 
 
 def _taking_part(contact: Contact, part: jax.Array) -> Contact:
-    """The contacts where those outside `part` (m,) are decoupled, at rest, and at a gap of 1 m."""
+    """The contacts where those outside `part` (m,) are decoupled, at rest, and at a gap
+    of 1 m.
+    """
     w = decoupled(contact.delassus, part)
     block = contact.tangential_block
     if block is not None:
@@ -336,13 +412,17 @@ def _taking_part(contact: Contact, part: jax.Array) -> Contact:
 
 
 @full_precision
-def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """gamma- (m,) [m/s], 0 where it is within the rounding of v- (n,), and that rounding (m,).
+def rounded_gap_velocity(
+    scene: Scene, velocity: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """gamma- (m,) [m/s], 0 where it is within the rounding of v- (n,), and that
+    rounding (m,).
 
-    Equation: `gamma- = N^T v-`, its rounding `eps |N|^T |v-|`, eps that of one sum. The derivative
-    of gamma- remains that of N^T v- where its value is set to 0.
+    Equation: `gamma- = N^T v-`, its rounding `eps |N|^T |v-|`, eps that of one sum. The
+    derivative of gamma- remains that of N^T v- where its value is set to 0.
     """
-    gamma, speed = gap_velocity(scene, velocity), jax.lax.stop_gradient(jnp.abs(velocity))
+    gamma = gap_velocity(scene, velocity)
+    speed = jax.lax.stop_gradient(jnp.abs(velocity))
     if scene.pairs is not None:
         size = jax.tree.map(jnp.abs, scene.pairs).rates(speed)
     elif scene.walls is None:
@@ -383,7 +463,8 @@ def delassus_matrix(scene: Scene) -> Symmetric:
 
 
 def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
-    """The Delassus matrix with rows and columns of open contacts 0 but for their diagonal entry.
+    """The Delassus matrix with rows and columns of open contacts 0 but for their
+    diagonal entry.
 
     `closed` (m,) is True for contacts that stay coupled.
     """
@@ -397,7 +478,9 @@ def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
 
 
 def kinetic_norm(scene: Scene) -> jax.Array:
-    """`|grad f_j| = sqrt(N_j^T M^-1 N_j)` (m,) [1 / sqrt(kg)], without bilateral constraints."""
+    """`|grad f_j| = sqrt(N_j^T M^-1 N_j)` (m,) [1 / sqrt(kg)], without bilateral
+    constraints.
+    """
     if scene.walls is not None or scene.pairs is not None:
         return jnp.sqrt(diagonal(delassus_matrix(scene)))
     moved = solve_mass(without_constraints(scene), scene.normals)
@@ -417,7 +500,9 @@ def normalized_delassus(scene: Scene) -> Symmetric:
         G (m, m), or `Tridiagonal` for a chain.
 
     >>> import jimpact as ji
-    >>> ji.theory.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
+    >>> ji.theory.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(
+    ...     3
+    ... ).tolist()
     [-0.5]
     """
     return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
@@ -448,7 +533,7 @@ def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
 
 @full_precision
 def kinetic_angles(scene: Scene) -> jax.Array:
-    """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
+    """Angles `pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
 
     Args:
         scene: n coordinates, m contacts.
@@ -456,9 +541,9 @@ def kinetic_angles(scene: Scene) -> jax.Array:
     Returns:
         Angles (m, m) [rad], pi on the diagonal.
 
-    G is the normalized `delassus_matrix`, so bilateral constraints count: contacts of bodies that a
-    constraint ties together are coupled. (6.66) takes the masses alone, where they are decoupled:
-    that is the angle of `Scene(scene.mass, scene.normals)`.
+    G is the normalized `delassus_matrix`, so bilateral constraints count: contacts of
+    bodies that a constraint ties together are coupled. (6.66) takes the masses alone,
+    where they are decoupled: that is the angle of `Scene(scene.mass, scene.normals)`.
 
     Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
     Source: Brogliato (2016), (6.66), with the W of the constrained bodies.
@@ -479,11 +564,12 @@ def _angles(w: Symmetric) -> jax.Array:
 def coupled_groups(scene: Scene) -> Groups | None:
     """Groups of contacts between which the Delassus matrix is zero whatever its values.
 
-    Groups follow from the zeros of M, N, tangents and constraints, never from rounded values of W:
-    contacts of a group move a common coordinate, or coordinates joined by an entry of a dense M or
-    by bilateral constraints. Open contacts are in no group (with traced gaps all contacts count as
-    closed). The result is None where all contacts form one group, where the zeros are not known on
-    the host, and for a chain or packing, whose W has only O(m) entries.
+    Groups follow from the zeros of M, N, tangents and constraints, never from rounded
+    values of W: contacts of a group move a common coordinate, or coordinates joined by
+    an entry of a dense M or by bilateral constraints. Open contacts are in no group
+    (with traced gaps all contacts count as closed). The result is None where all
+    contacts form one group, where the zeros are not known on the host, and for a chain
+    or packing, whose W has only O(m) entries.
 
     >>> import jimpact as ji
     >>> from jimpact.core.contact import coupled_groups
@@ -491,7 +577,8 @@ def coupled_groups(scene: Scene) -> Groups | None:
     >>> [group.tolist() for group in coupled_groups(two_pairs)]
     [[[0], [1]]]
     """
-    m, tangents = scene.contacts, scene.tangents
+    m = scene.contacts
+    tangents = scene.tangents
     if scene.walls is not None or scene.pairs is not None or m == 1:
         return None
     if is_traced((scene.normals, tangents, scene.constraints)):
@@ -499,7 +586,10 @@ def coupled_groups(scene: Scene) -> Groups | None:
     if scene.mass.ndim == 2 and is_traced(scene.mass):
         return None
     known = scene.gaps is not None and not is_traced(scene.gaps)
-    members = np.flatnonzero(np.asarray(scene.gaps) <= 0) if known else np.arange(m)
+    if known:
+        members = np.flatnonzero(np.asarray(scene.gaps) <= 0)
+    else:
+        members = np.arange(m)
     if len(members) == 0:
         return None
     moves = np.asarray(scene.normals) != 0
@@ -512,24 +602,33 @@ def coupled_groups(scene: Scene) -> Groups | None:
         touched.append(np.asarray(scene.constraints) != 0)
     label = components(np.concatenate(touched, axis=1))[: len(members)]
     groups = [members[label == first] for first in np.unique(label)]
-    return None if len(groups[0]) == m else _by_size(groups, m)
+    if len(groups[0]) == m:
+        return None
+    return _by_size(groups, m)
 
 
 def _by_size(groups: list[np.ndarray], m: int) -> Groups:
-    """The groups, of m contacts in all, in one padded array, or in one of small and one of large.
+    """The groups, of m contacts in all, in one padded array, or in one of small and one
+    of large.
 
-    The split is where W of all padded groups has the fewest entries, `c g^2` of c groups of g.
+    The split is where W of all padded groups has the fewest entries, `c g^2` of c
+    groups of g.
     """
     groups = sorted(groups, key=len)  # stable
     size = np.array([len(group) for group in groups])
     smaller = np.arange(len(groups))  # number of groups in the first array
     entries = smaller * size[smaller - 1] ** 2 + (len(groups) - smaller) * size[-1] ** 2
-    cut = int(np.argmin(entries)) if entries[0] > WORTH_A_PROGRAM * entries.min() else 0
+    if entries[0] > WORTH_A_PROGRAM * entries.min():
+        cut = int(np.argmin(entries))
+    else:
+        cut = 0
 
     def padded(part: list[np.ndarray]) -> np.ndarray:
         """Groups (c, g), each padded to the length g of the last one, see `Groups`."""
         most = len(part[-1])
-        return np.stack([np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part])
+        return np.stack(
+            [np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part]
+        )
 
     return tuple(padded(part) for part in (groups[:cut], groups[cut:]) if part)
 
@@ -539,19 +638,30 @@ def contacts_of_groups(
 ) -> list[Contact]:
     """The contacts of each array of groups (c, g), with a leading axis (c,).
 
-    `velocity` is v- (n,) [m/s], `stored` (m,) [J]. W of all contacts is never formed. An entry that
-    only pads its group is like an open contact.
+    `velocity` is v- (n,) [m/s], `stored` (m,) [J]. W of all contacts is never formed.
+    An entry that only pads its group is like an open contact.
     """
     gamma, noise = rounded_gap_velocity(scene, velocity)
-    m, norm = scene.contacts, kinetic_norm(scene)
-    gaps = jnp.zeros_like(gamma) if scene.gaps is None else scene.gaps
-    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m  # tangents of a contact
+    m = scene.contacts
+    norm = kinetic_norm(scene)
+    if scene.gaps is None:
+        gaps = jnp.zeros_like(gamma)
+    else:
+        gaps = scene.gaps
+    # tangents of a contact
+    if scene.tangents is None:
+        each = 0
+    else:
+        each = scene.tangents.shape[1] // m
     columns = scene.normals  # (N, H)
     if scene.tangents is not None:
         columns = jnp.concatenate([columns, scene.tangents], axis=1)
         slip = scene.tangents.T @ velocity
     moved = solve_mass(scene, columns)  # M^-1 (N, H)
-    held = None if scene.constraints is None else held_by_constraints(scene)
+    if scene.constraints is None:
+        held = None
+    else:
+        held = held_by_constraints(scene)
 
     def contacts_of(padded: np.ndarray) -> Contact:
         """The contacts of padded groups (c, g), see `Groups`."""
@@ -562,8 +672,13 @@ def contacts_of_groups(
         directions = jnp.concatenate([index, m + tangents], axis=1)  # of (N, H)
         part = jnp.asarray(padded < m) & scene.closed[index]
         # [[W, W_nt], [W_tn, W_tt]] of each group
-        matrix = jnp.einsum("nca,ncb->cab", columns[:, directions], moved[:, directions])
-        block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents]) if each else None
+        matrix = jnp.einsum(
+            "nca,ncb->cab", columns[:, directions], moved[:, directions]
+        )
+        if each:
+            block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents])
+        else:
+            block = None
         contact = Contact(
             matrix[:, :g, :g],
             gamma[index],

@@ -1,4 +1,6 @@
-"""Distributions that samples are drawn from: uniform, normal, rows of an array, own functions."""
+"""Distributions that samples are drawn from: uniform, normal, rows of an array, own
+functions.
+"""
 
 import abc
 import operator
@@ -22,7 +24,8 @@ from jimpact.tools.checks import (
 )
 
 OVERLAP = (
-    "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
+    "a negative gap is an overlap, that is a precompressed contact: give LZB the "
+    "energy stored in "
     "it (`initial_energy`) and leave the gap at 0."
 )
 
@@ -32,11 +35,15 @@ class Distribution(eqx.Module):
 
     def __repr__(self) -> str:
         """The distribution as one writes it."""
-        words = ", ".join(f"{name}={_short(value)}" for name, value in vars(self).items())
+        words = ", ".join(
+            f"{name}={_short(value)}" for name, value in vars(self).items()
+        )
         return f"{type(self).__name__}({words})"
 
     @abc.abstractmethod
-    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+    def sample(
+        self, key: jax.Array, size: int, dtype: Any, non_negative: bool
+    ) -> jax.Array:
         """One draw (size,); with `non_negative` truncated at 0."""
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
@@ -47,7 +54,8 @@ class Distribution(eqx.Module):
         for field, value in vars(self).items():
             if np.shape(value) not in ((), (size,)):
                 raise ValueError(
-                    f"Argument `{name}` must have scalars or {size} values in `{field}`, but is "
+                    f"Argument `{name}` must have scalars or {size} values in "
+                    f"`{field}`, but is "
                     f"{self!r}."
                 )
 
@@ -72,29 +80,42 @@ class Uniform(Distribution):
 
     def __init__(self, low: Any, high: Any):
         """Check both ends."""
-        self.low, self.high = as_numbers("low", low), as_numbers("high", high)
+        self.low = as_numbers("low", low)
+        self.high = as_numbers("high", high)
         if np.any(np.asarray(self.low) > np.asarray(self.high)):
-            raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
+            raise ValueError(
+                f"Argument `high` must be at least `low`, but has {self!r}."
+            )
 
-    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+    def sample(
+        self, key: jax.Array, size: int, dtype: Any, non_negative: bool
+    ) -> jax.Array:
         """One draw (size,): `low + (high - low) u`, u uniform in [0, 1)."""
-        low, high = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high))
-        return jnp.minimum(low + (high - low) * jax.random.uniform(key, (size,), dtype), high)
+        low, high = (
+            jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high)
+        )
+        return jnp.minimum(
+            low + (high - low) * jax.random.uniform(key, (size,), dtype), high
+        )
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
-        """Raise a ValueError for another shape, and, where `non_negative`, for a `low` below 0."""
+        """Raise a ValueError for another shape, and, where `non_negative`, for a `low`
+        below 0.
+        """
         super().check(name, size, non_negative)
         if non_negative and np.any(np.asarray(self.low) < 0):
             raise ValueError(
-                f"Argument `{name}` must not yield negative values, but {self!r} does; {OVERLAP}"
+                f"Argument `{name}` must not yield negative values, but {self!r} does; "
+                f"{OVERLAP}"
             )
 
 
 class Normal(Distribution):
     """Independent and normal.
 
-    As a distribution of gaps it is truncated at 0 (drawn again, not clipped), so the gaps have a
-    larger mean and a smaller spread than `mean` and `std` say where these are comparable.
+    As a distribution of gaps it is truncated at 0 (drawn again, not clipped), so the
+    gaps have a larger mean and a smaller spread than `mean` and `std` say where these
+    are comparable.
 
     Args:
         mean: scalar or one per entry (m,), in the unit of what is drawn.
@@ -116,20 +137,29 @@ class Normal(Distribution):
         self.mean = as_numbers("mean", mean)
         self.std = as_numbers("std", std, low=0.0, open_low=True)
 
-    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
-        """One draw (size,): `mean + std z`, z normal; `non_negative`: truncated at 0."""
-        mean, std = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std))
+    def sample(
+        self, key: jax.Array, size: int, dtype: Any, non_negative: bool
+    ) -> jax.Array:
+        """One draw (size,): `mean + std z`, z normal; `non_negative`: truncated at
+        0.
+        """
+        mean, std = (
+            jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std)
+        )
         if not non_negative:
             return mean + std * jax.random.normal(key, (size,), dtype)
         unit = jax.random.truncated_normal(key, -mean / std, jnp.inf, (size,), dtype)
         return jnp.maximum(mean + std * unit, 0)  # rounding only
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
-        """Raise a ValueError for another shape, and, where `non_negative`, for a mean below 0."""
+        """Raise a ValueError for another shape, and, where `non_negative`, for a mean
+        below 0.
+        """
         super().check(name, size, non_negative)
         if non_negative and np.any(np.asarray(self.mean) < 0):
             raise ValueError(
-                f"Argument `{name}` is truncated at 0 and must have a mean of at least 0, but is "
+                f"Argument `{name}` is truncated at 0 and must have a mean of at least "
+                f"0, but is "
                 f"{self!r}; {OVERLAP}"
             )
 
@@ -149,16 +179,19 @@ class RandomLaw(eqx.Module):
 
     Args:
         law: everything that is not drawn.
-        parameters: by field, `restitution=Uniform(0.8, 0.9)`; entries are independent (give the
-            law a scalar to have one value for all contacts).
+        parameters: by field, `restitution=Uniform(0.8, 0.9)`; entries are independent
+            (give the law a scalar to have one value for all contacts).
 
     Raises:
-        TypeError: no law. ValueError: no such field, or a distribution that leaves its domain (as a
-            Normal does where the domain is bounded; a function `key -> Law` may do anything).
+        TypeError: no law. ValueError: no such field, or a distribution that leaves its
+            domain (as a Normal does where the domain is bounded; a function
+            `key -> Law` may do anything).
 
     >>> import jax
     >>> import jimpact as ji
-    >>> drawn = ji.RandomLaw(ji.Newton(0.5), restitution=ji.Uniform(0.8, 0.9))(jax.random.key(0))
+    >>> drawn = ji.RandomLaw(ji.Newton(0.5), restitution=ji.Uniform(0.8, 0.9))(
+    ...     jax.random.key(0)
+    ... )
     >>> 0.8 <= float(drawn.restitution) <= 0.9
     True
     """
@@ -167,10 +200,13 @@ class RandomLaw(eqx.Module):
     parameters: dict[str, Distribution]
 
     def __init__(self, law: Law, **parameters: Distribution):
-        """Check that the law has such parameters, and that they stay in their domains."""
+        """Check that the law has such parameters, and that they stay in their
+        domains.
+        """
         if isinstance(law, type):
             raise TypeError(
-                "Argument `law` must be a law with its values, as in `RandomLaw(LZB(0.9), "
+                "Argument `law` must be a law with its values, as in "
+                "`RandomLaw(LZB(0.9), "
                 f"restitution=Uniform(0.8, 0.9))`, but is the class {law.__name__}."
             )
         check_kind("law", law, Law)
@@ -189,32 +225,42 @@ class RandomLaw(eqx.Module):
                 )
             if not isinstance(distribution, Distribution):
                 raise TypeError(
-                    f"Argument `{name}` must be Uniform or Normal, but is {distribution!r}."
+                    f"Argument `{name}` must be Uniform or Normal, but is "
+                    f"{distribution!r}."
                 )
             distribution.check(name, known[name].value.size, False)
             _check_domain(name, distribution, known[name].domain)
-        self.law, self.parameters = law, parameters
+        self.law = law
+        self.parameters = parameters
 
     def __repr__(self) -> str:
         """The law's name with its random parameters."""
-        words = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        words = ", ".join(
+            f"{name}={value!r}" for name, value in self.parameters.items()
+        )
         return f"{type(self.law).__name__}({words})"
 
     def __call__(self, key: jax.Array) -> Law:
-        """The law whose random parameters are drawn by this key, each by a key of its own."""
-        law, known = self.law, free_parameters_of(self.law)
+        """The law whose random parameters are drawn by this key, each by a key of its
+        own.
+        """
+        law = self.law
+        known = free_parameters_of(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
             old, path, _ = known[name]
-            new = distribution.sample(jax.random.fold_in(key, i), old.size, old.dtype, False)
+            new = distribution.sample(
+                jax.random.fold_in(key, i), old.size, old.dtype, False
+            )
             law = eqx.tree_at(operator.attrgetter(path), law, new.reshape(old.shape))
         return law
 
 
 def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
-    """The argument `name` checked: a distribution, a function of a key, rows (S, size) or (size,).
+    """The argument `name` checked: a distribution, a function of a key, rows (S, size)
+    or (size,).
 
-    Raise a ValueError for another size, and, where `non_negative`, for negative entries; a
-    TypeError for a function that gives no array.
+    Raise a ValueError for another size, and, where `non_negative`, for negative
+    entries; a TypeError for a function that gives no array.
     """
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)
@@ -222,14 +268,18 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
     if callable(value):
         drawn = value(jax.random.key(0, impl="threefry2x32"))
         if not eqx.is_array(drawn):
-            raise TypeError(f"Argument `{name}` must give an array for a key, but gives {drawn!r}.")
+            raise TypeError(
+                f"Argument `{name}` must give an array for a key, but gives {drawn!r}."
+            )
         check_shape(f"{name}(key)", drawn, (size,), "one draw")
         warn_without_key(name, value)
         return value
     array = as_float_array(name, value)
     several = array.ndim == 2
     shape = (len(array), size) if several else (size,)
-    as_numbers(name, array, shape, "one sample a row" if several else "or one sample a row")
+    as_numbers(
+        name, array, shape, "one sample a row" if several else "or one sample a row"
+    )
     if non_negative and np.any(np.asarray(array) < 0):
         where = np.argwhere(np.asarray(array) < 0)[0].tolist()
         raise ValueError(
@@ -240,27 +290,38 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
 
 
 def warn_without_key(name: str, function: Callable[[jax.Array], Any]) -> None:
-    """Warn where a function draws without its key, so that it is the same in all samples."""
+    """Warn where a function draws without its key, so that it is the same in all
+    samples.
+    """
     program = jax.make_jaxpr(function)(jax.random.key(0, impl="threefry2x32")).jaxpr
     if not any(program.invars[0] is x for step in program.eqns for x in step.invars):
         warnings.warn(
-            f"Argument `{name}` draws without its key: it is compiled once, and the same in all "
-            "samples, whatever numpy.random would give. Draw by jax.random.uniform(key, ...), say.",
+            f"Argument `{name}` draws without its key: it is compiled once, and the "
+            f"same in all "
+            "samples, whatever numpy.random would give. Draw by "
+            "jax.random.uniform(key, ...), say.",
             stacklevel=2,
         )
 
 
 def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
-    """Raise a ValueError where draws can leave the `domain`; a Normal can give any number."""
+    """Raise a ValueError where draws can leave the `domain`; a Normal can give any
+    number.
+    """
     low, high = domain.bounds
-    least, most = (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
+    least, most = (
+        (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
+    )
     if np.min(least) < low or np.max(most) > high:
         raise ValueError(
-            f"Argument `{name}` must lie in [{low:g}, {high:g}], but {drawn!r} can leave it."
+            f"Argument `{name}` must lie in [{low:g}, {high:g}], but {drawn!r} can "
+            f"leave it."
         )
 
 
 def _short(value: jax.Array) -> str:
     """A number, or a list of numbers, as text."""
     entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
-    return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"
+    if np.ndim(value) == 0:
+        return entries[0]
+    return f"[{', '.join(entries)}]"

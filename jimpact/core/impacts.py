@@ -1,4 +1,6 @@
-"""`impact`: the one place that turns a law's impulses into velocities, energy and status."""
+"""`impact`: the one place that turns a law's impulses into velocities, energy and
+status.
+"""
 
 import dataclasses
 import warnings
@@ -10,7 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.contact import Contact, Groups, contacts_of_groups, coupled_groups
-from jimpact.core.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
+from jimpact.core.law import (
+    Impulses,
+    Law,
+    check_law,
+    is_separable,
+    restrict_law,
+    within_domains,
+)
 from jimpact.core.scene import (
     Scene,
     as_velocity,
@@ -34,29 +43,29 @@ from jimpact.tools.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.tools.precision import check_rtol, precision
 from jimpact.tools.status import CODE, STATUS, raise_for, sign_tolerance
 
-# Negative impulses are rounding up to this many times the impulse that would undo the noise of
-# gamma-: a law removes up to twice the noise, and coupled contacts pass it on a few times. Ten
-# times more would hide a contact that pulls slightly.
+# Negative impulses are rounding up to this many times the impulse that would undo the
+# noise of gamma-: a law removes up to twice the noise, and coupled contacts pass it on
+# a few times. Ten times more would hide a contact that pulls slightly.
 ROUNDING_PUSHES = 8
 
-# Signs and gains of energy are violated beyond this multiple of the accuracy that a law allows
-# itself: an error of a velocity counts twice in the energy. Ten times more: a law that misses its
-# tolerance by 40 of them passes.
+# Signs and gains of energy are violated beyond this multiple of the accuracy that a law
+# allows itself: an error of a velocity counts twice in the energy. Ten times more: a
+# law that misses its tolerance by 40 of them passes.
 ACCURACIES = 4
 
-# Number of contacts of the compiled program that single impacts of fewer contacts share. Compiling
-# takes a second for each number of contacts; padding by open contacts costs a tenth of the impact.
-# Ten times more would make every first impact slow.
+# Number of contacts of the compiled program that single impacts of fewer contacts
+# share. Compiling takes a second for each number of contacts; padding by open contacts
+# costs a tenth of the impact. Ten times more would make every first impact slow.
 SHARED = 8
 
 
 class Impact(eqx.Module):
     """Outcome of an impact; under `vmap` every field has the axes of the batch first.
 
-    `velocity` v+ (n,) [m/s]; `impulse` p (m,) [N s]; `tangential_impulse` (t,), t = 0 without
-    friction [N s]; `energy_change` T+ - T- () [J]; `initial_energy` stored before () [J]; `status`
-    () int32, a row of `jimpact.STATUS`, 0 = ok; `accuracy` (), the error of v+ that the law allows
-    itself, relative to the size of the impact.
+    `velocity` v+ (n,) [m/s]; `impulse` p (m,) [N s]; `tangential_impulse` (t,), t = 0
+    without friction [N s]; `energy_change` T+ - T- () [J]; `initial_energy` stored
+    before () [J]; `status` () int32, a row of `jimpact.STATUS`, 0 = ok; `accuracy` (),
+    the error of v+ that the law allows itself, relative to the size of the impact.
     """
 
     velocity: jax.Array
@@ -89,44 +98,51 @@ def impact(
     approach: Any = None,
     rtol: Any = None,
 ) -> Impact:
-    """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
+    """Velocities after the impact of `law` on `scene`: pure, for jit, vmap and grad.
 
     Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (a + b) / 2`,
-    `a = (gamma+ + gamma-)^T p`, `b = (u+ + u-)^T p_t`; N (n, m) holds the contact normals,
+    `a = (gamma+ + gamma-)^T p`, `b = (u+ + u-)^T p_t`; N (n, m) holds the contact
+    normals,
     H (n, t) the tangents, u = H^T v are the slip velocities.
 
-    Independent groups of contacts (two pairs of balls in one scene) are solved separately if the
-    scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
-    Approach within the rounding of v- (or within `noise`) counts as 0.
+    Independent groups of contacts (two pairs of balls in one scene) are solved
+    separately if the scene is known, not traced, and the law allows it
+    (`Law.separable`); the outcome is the same. Approach within the rounding of v- (or
+    within `noise`) counts as 0.
 
     Args:
         law: its parameters are scalars or (m,); a restitution matrix is (m, m).
-        scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
+        scene: n coordinates, m contacts; contacts with gap > 0 take no part in
+            instantaneous laws.
         velocity: v- (n,) [m/s], [rad/s] for rotations.
-        noise: speed () [m/s] up to which an approach counts as rounding: in a motion v- has the
-            rounding of the largest earlier speeds. None: the rounding of v-.
-        approach: speed () [m/s] subtracted from every gap velocity before the law is applied; a
-            small value starts an impact without collision. None: 0.
-        rtol: tolerance () on v+ for a law whose option `rtol` is None, at most 1 and at least what
-            the type holds (3.6e-15, in single precision 1.9e-6); unlike that option it may be
-            traced. None: the law's default.
+        noise: speed () [m/s] up to which an approach counts as rounding: in a motion v-
+            has the rounding of the largest earlier speeds. None: the rounding of v-.
+        approach: speed () [m/s] subtracted from every gap velocity before the law is
+            applied; a small value starts an impact without collision. None: 0.
+        rtol: tolerance () on v+ for a law whose option `rtol` is None, at most 1 and at
+            least what the type holds (3.6e-15, in single precision 1.9e-6); unlike that
+            option it may be traced. None: the law's default.
 
     Returns:
-        `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
-        `initial_energy` (), `status` () int32, 0 = ok (`raise_on_failure`, `jimpact.STATUS`).
+        `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`,
+        `energy_change` (), `initial_energy` (), `status` () int32, 0 = ok
+        (`raise_on_failure`, `jimpact.STATUS`).
 
     Raises:
-        ValueError: shapes or ranges, on the host. Where they are traced, the status reports them:
-            `not_finite` (NaN in the velocity, a gap, `noise`, `approach` or `rtol`), or
-            `out_of_range` (a parameter outside its domain, a normal that is 0, a mass that is
-            asymmetric or not positive, a negative gap, `noise` or `approach`, an `rtol` beyond its
-            range, a velocity that breaks a bilateral constraint). An energy of the impact,
-            `sum gamma-^2 / W_jj`, that the floating type takes for 0 or infinite is `out_of_range`
-            on the host, too: choose other units.
+        ValueError: shapes or ranges, on the host. Where they are traced, the status
+            reports them: `not_finite` (NaN in the velocity, a gap, `noise`, `approach`
+            or `rtol`), or `out_of_range` (a parameter outside its domain, a normal that
+            is 0, a mass that is asymmetric or not positive, a negative gap, `noise` or
+            `approach`, an `rtol` beyond its range, a velocity that breaks a bilateral
+            constraint). An energy of the impact,
+            `sum gamma-^2 / W_jj`, that the floating type takes for 0 or infinite is
+            `out_of_range` on the host, too: choose other units.
             Warns where only open contacts approach and the law leaves those out.
 
     >>> import jimpact as ji
-    >>> out = ji.impact(ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0])
+    >>> out = ji.impact(
+    ...     ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0]
+    ... )
     >>> [round(float(v), 4) for v in out.velocity]
     [-0.0086, 0.1041, 0.9045]
     """
@@ -147,11 +163,17 @@ def impact(
         if not is_traced(rtol):
             check_rtol(float(rtol), v.dtype)
     given = _Given(
-        *(None if x is None else jnp.asarray(x, v.dtype) for x in (noise, approach, rtol))
+        *(
+            None if x is None else jnp.asarray(x, v.dtype)
+            for x in (noise, approach, rtol)
+        )
     )
     if scene.gaps is not None and not law.uses_gaps:
         _warn_of_unused_gaps(law, scene, v)
-    groups = coupled_groups(scene) if is_separable(law) else None
+    if is_separable(law):
+        groups = coupled_groups(scene)
+    else:
+        groups = None
     if groups is None and _shares_a_program(law, scene, v, given):
         return _impact_of_padded_scene(law, scene, v, given)
     with naming_the_adjoint():
@@ -163,36 +185,48 @@ def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
     if is_traced((scene, v)):
         return
     with jax.ensure_compile_time_eval():  # inside jit, too, where scene and v are known
-        approaches, stored = np.asarray(gap_velocity(scene, v)) < 0, law.stored
+        approaches = np.asarray(gap_velocity(scene, v)) < 0
+        stored = law.stored
     closed = np.asarray(scene.gaps) == 0
     nothing = approaches.any() and not (approaches & closed).any()
     if nothing and not is_traced(stored) and not np.any(stored):
         warnings.warn(
-            f"Nothing happens: only open contacts (gap > 0) approach, and {type(law).__name__} "
+            f"Nothing happens: only open contacts (gap > 0) approach, and "
+            f"{type(law).__name__} "
             "leaves them out. Laws that use gaps are Compliant and Binary.",
             stacklevel=4,  # the line that calls `impact`, through `full_precision`
         )
 
 
 class _Given(NamedTuple):
-    """The arguments `noise` [m/s], `approach` [m/s] and `rtol` of `impact`; None: its default."""
+    """The arguments `noise` [m/s], `approach` [m/s] and `rtol` of `impact`; None: its
+    default.
+    """
 
     noise: jax.Array | None = None
     approach: jax.Array | None = None
     rtol: jax.Array | None = None
 
     def applied(self, contact: Contact) -> Contact:
-        """The contacts with gamma 0 within `noise`, then less `approach`, integrated to `rtol`."""
-        contact = contact if self.noise is None else contact.within(self.noise)
-        contact = contact if self.rtol is None else contact.integrated_to(self.rtol)
-        return contact if self.approach is None else contact.approaching(self.approach)
+        """The contacts with gamma 0 within `noise`, then less `approach`, integrated to
+        `rtol`.
+        """
+        if self.noise is not None:
+            contact = contact.within(self.noise)
+        if self.rtol is not None:
+            contact = contact.integrated_to(self.rtol)
+        if self.approach is None:
+            return contact
+        return contact.approaching(self.approach)
 
 
 NOTHING_GIVEN = _Given()
 
 
 class Traced(NamedTuple):
-    """True for each argument of `impact` that is traced, so that the host could not check it."""
+    """True for each argument of `impact` that is traced, so that the host could not
+    check it.
+    """
 
     law: bool = False
     scene: bool = False
@@ -200,9 +234,15 @@ class Traced(NamedTuple):
     given: bool = False
 
     @classmethod
-    def of(cls, law: Law, scene: Scene, v: jax.Array, given: _Given = NOTHING_GIVEN) -> "Traced":
-        """The flags of these arguments; the constraints are checked with the velocity."""
-        constrained = scene.constraints is not None and is_traced((scene.constraints, v))
+    def of(
+        cls, law: Law, scene: Scene, v: jax.Array, given: _Given = NOTHING_GIVEN
+    ) -> "Traced":
+        """The flags of these arguments; the constraints are checked with the
+        velocity.
+        """
+        constrained = scene.constraints is not None and is_traced(
+            (scene.constraints, v)
+        )
         return cls(is_traced(law), is_traced(scene), constrained, is_traced(given))
 
     def status(
@@ -214,8 +254,9 @@ class Traced(NamedTuple):
     ) -> jax.Array:
         """Status code () of an impact: `code`, or the reason why it has no outcome.
 
-        `arguments` are its law, scene, v- and given values; `size` () [sqrt(J)] is the root of its
-        energy `sum gamma-^2 / W_jj`; `finite` () is True where its results are finite.
+        `arguments` are its law, scene, v- and given values; `size` () [sqrt(J)] is the
+        root of its energy `sum gamma-^2 / W_jj`; `finite` () is True where its results
+        are finite.
         """
         code = jnp.where(finite, code, CODE["not_finite"])
         code = jnp.where(_has_scale(size, arguments[2]), code, CODE["out_of_range"])
@@ -224,8 +265,12 @@ class Traced(NamedTuple):
             code = jnp.where(refused > CODE["ok"], refused, code)
         return code.astype(jnp.int32)
 
-    def _refusal(self, law: Law, scene: Scene, v: jax.Array, given: _Given) -> jax.Array:
-        """`not_finite` or `out_of_range` where an argument is not allowed, else `ok`."""
+    def _refusal(
+        self, law: Law, scene: Scene, v: jax.Array, given: _Given
+    ) -> jax.Array:
+        """`not_finite` or `out_of_range` where an argument is not allowed, else
+        `ok`.
+        """
         inputs = [x for x, traced in zip((law, scene, None, given), self) if traced]
         numbers = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
         unknown = [jnp.any(jnp.isnan(x)) for x in numbers]
@@ -240,15 +285,19 @@ class Traced(NamedTuple):
             allowed += [(x >= 0) & (x < jnp.inf) for x in given if x is not None]
         if self.given and given.rtol is not None:
             allowed.append((given.rtol >= precision(v.dtype).noise) & (given.rtol <= 1))
-        code = jnp.where(jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"])
+        code = jnp.where(
+            jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"]
+        )
         return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
 
 
 def _shares_a_program(law: Law, scene: Scene, v: jax.Array, given: _Given) -> bool:
-    """Whether an impact runs by the program for SHARED contacts, so that it need not be compiled.
+    """Whether an impact runs by the program for SHARED contacts, so that it need not be
+    compiled.
 
-    The law allows it, the scene has at most that many contacts, no friction and not two walls, and
-    nothing is traced or inside another program: what surrounds an impact sees its true sizes.
+    The law allows it, the scene has at most that many contacts, no friction and not two
+    walls, and nothing is traced or inside another program: what surrounds an impact
+    sees its true sizes.
     """
     allowed = is_separable(law) and law.pads_scenes
     plain = scene.walls != (True, True) and scene.tangents is None
@@ -257,7 +306,9 @@ def _shares_a_program(law: Law, scene: Scene, v: jax.Array, given: _Given) -> bo
     return not is_traced((law, scene, v, given)) and is_top_level_call()
 
 
-def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, given: _Given) -> Impact:
+def _impact_of_padded_scene(
+    law: Law, scene: Scene, v: jax.Array, given: _Given
+) -> Impact:
     """The impact by the program for SHARED contacts: those that are added are open."""
     padded = pad_scene(scene, SHARED)
     velocity: Any = np.zeros(padded.scene.size, v.dtype)
@@ -275,18 +326,22 @@ def check_constrained(scene: Scene, velocity: jax.Array) -> None:
     """A velocity that breaks a bilateral constraint is an error."""
     if is_traced((scene.constraints, velocity)):
         return
-    h, v = np.asarray(scene.constraints), np.asarray(velocity)
+    h = np.asarray(scene.constraints)
+    v = np.asarray(velocity)
     keeps = _keeps_constraints(h, v)
     if not keeps.all():
         j = int(np.argmin(keeps))
         raise ValueError(
-            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but "
+            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
+            "0, but "
             f"constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
         )
 
 
 def _keeps_constraints(constraints: Any, velocity: Any) -> Any:
-    """True (b,) where `|h^T v| <= tolerance |h|^T |v|`, h (n, b): gradients of constraints."""
+    """True (b,) where `|h^T v| <= tolerance |h|^T |v|`, h (n, b): gradients of
+    constraints.
+    """
     size = abs(constraints).T @ abs(velocity)
     return abs(constraints.T @ velocity) <= sign_tolerance(velocity.dtype) * size
 
@@ -302,8 +357,8 @@ def _impact(
 ) -> Impact:
     """The outcome from the law's impulses p: velocities, energy and status.
 
-    Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (v+ - v-)^T M (v+ + v-) / 2`, which may
-    exceed the stored energy by the noise of the outcome only.
+    Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (v+ - v-)^T M (v+ + v-) / 2`,
+    which may exceed the stored energy by the noise of the outcome only.
     """
     if groups is None:
         contact = given.applied(law.contact(scene, v))
@@ -312,25 +367,31 @@ def _impact(
         stored = contact.stored
     else:
         outcome, happens, stored = _in_groups(law, scene, v, groups, given)
-    p, tangential = outcome.normal, outcome.tangential
+    p = outcome.normal
+    tangential = outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
-    # over bodies, not as p . (gamma- + gamma+) / 2 over contacts: next to a much lighter body the
-    # terms of gamma+ = gamma- + W p cancel
+    # over bodies, not as p . (gamma- + gamma+) / 2 over contacts: next to a much
+    # lighter body the terms of gamma+ = gamma- + W p cancel
     change = 0.5 * momentum(scene, jump) @ (v + v_plus)
     total = jnp.sum(stored)
     code = jnp.where(change > total + outcome.noise, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
-    finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
-    size = jnp.where(happens, outcome.size, 1.0)  # no scale can be out of range without an impact
+    finite = (
+        jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
+    )
+    # no scale can be out of range without an impact
+    size = jnp.where(happens, outcome.size, 1.0)
     code = traced.status((law, scene, v, given), code, size, finite)
     return Impact(v_plus, p, tangential, change, total, code, outcome.accuracy)
 
 
 def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
-    """True () where the energy `size^2` of an impact is neither 0 nor infinite to the precision.
+    """True () where the energy `size^2` of an impact is neither 0 nor infinite to the
+    precision.
 
-    True as well where the velocity v (n,) is not finite, and the energy can have no value.
+    True as well where the velocity v (n,) is not finite, and the energy can have no
+    value.
     """
     tiny = precision(size.dtype).tiny
     inside = (size**2 >= tiny) & (size**2 < jnp.inf)
@@ -338,18 +399,22 @@ def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
 
 
 class _Resolved(NamedTuple):
-    """Impulses of contacts, the status of the law and of their signs, and two scales."""
+    """Impulses of contacts, the status of the law and of their signs, and two
+    scales.
+    """
 
     normal: jax.Array
     tangential: jax.Array
     status: jax.Array
     size: jax.Array  # () of the impact, square root of an energy
-    noise: jax.Array  # () energy that the rounding of v- and the law's accuracy leave unknown
+    # () energy that the rounding of v- and the law's accuracy leave unknown
+    noise: jax.Array
     accuracy: jax.Array  # () see `Impact`
 
 
 def judged_beyond(dtype: Any, accuracy: Any) -> Any:
-    """Share of the impact's size beyond which a wrong sign or a gain of energy is a violation.
+    """Share of the impact's size beyond which a wrong sign or a gain of energy is a
+    violation.
 
     Equation: `max(rounding of the type, ACCURACIES accuracy)`.
     """
@@ -357,9 +422,12 @@ def judged_beyond(dtype: Any, accuracy: Any) -> Any:
 
 
 def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
-    """The law's impulses; 0 without an impact (`happens` false), and at open contacts."""
+    """The law's impulses; 0 without an impact (`happens` false), and at open
+    contacts.
+    """
     gamma = contact.gap_velocity
-    # without an impact the law gets gamma- = -1 and its result is discarded: gradients stay finite
+    # without an impact the law gets gamma- = -1 and its result is discarded: gradients
+    # stay finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     approaching = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
     impulses = _impulses_of(law, law.impulses(approaching), contact)
@@ -375,29 +443,36 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     code = jnp.maximum(impulses.status, signs)
     code = jnp.where(happens, code, CODE["ok"])
     noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
-    return _Resolved(p, tangential, code, contact.size, noise, jnp.asarray(accuracy, p.dtype))
+    return _Resolved(
+        p, tangential, code, contact.size, noise, jnp.asarray(accuracy, p.dtype)
+    )
 
 
 def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
-    """The impulses that `law.impulses` returned, or an error unless they fit these contacts.
+    """The impulses that `law.impulses` returned, or an error unless they fit these
+    contacts.
 
     These are `normal` (m,), `tangential` (t,) or None, and a `status` of `ji.STATUS`.
     """
     name = f"`{type(law).__name__}.impulses`"
     if not isinstance(returned, tuple):  # an array would pass for its entries
-        raise TypeError(f"{name} must return `ji.Impulses`, but returns {type(returned).__name__}.")
+        raise TypeError(
+            f"{name} must return `ji.Impulses`, but returns {type(returned).__name__}."
+        )
     impulses = Impulses(*returned)
     t = contact.tangents * contact.contacts
     for part, size in (("normal", contact.contacts), ("tangential", t)):
         value = getattr(impulses, part)
         if value is not None and jnp.shape(value) != (size,):
             raise ValueError(
-                f"{name} must return `{part}` of shape ({size},), but returns one of shape "
+                f"{name} must return `{part}` of shape ({size},), but returns one of "
+                f"shape "
                 f"{jnp.shape(value)}."
             )
     if isinstance(impulses.status, int) and impulses.status not in CODE.values():
         raise ValueError(
-            f"{name} must return `status` of a row of `ji.STATUS`, below {len(STATUS)}, but "
+            f"{name} must return `status` of a row of `ji.STATUS`, below "
+            f"{len(STATUS)}, but "
             f"returns {impulses.status}."
         )
     return impulses._replace(normal=jnp.asarray(impulses.normal))
@@ -406,30 +481,42 @@ def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
 def _in_groups(
     law: Law, scene: Scene, v: jax.Array, groups: Groups, given: _Given
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
-    """Impulses of groups of contacts that W does not couple, each group solved by itself.
+    """Impulses of groups of contacts that W does not couple, each group solved by
+    itself.
 
-    Signs are judged on the scale of their group. A group without an impact gets p = 0, unless the
-    law also pulls at separating contacts.
+    Signs are judged on the scale of their group. A group without an impact gets p = 0,
+    unless the law also pulls at separating contacts.
 
     Returns:
-        The impulses of all contacts, `happens` () True if there is an impact in any group, and the
-        stored energy (m,) [J].
+        The impulses of all contacts, `happens` () True if there is an impact in any
+        group, and the stored energy (m,) [J].
     """
     m = scene.contacts
-    stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
+    stored = jnp.where(
+        scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0
+    )
     batches = [given.applied(c) for c in contacts_of_groups(scene, v, stored, groups)]
-    active = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in batches]
+    active = [
+        jax.vmap(lambda contact: contact.happens)(contacts) for contacts in batches
+    ]
     happens = jnp.any(jnp.concatenate(active))
     p = jnp.zeros(m, v.dtype)
-    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
+    if scene.tangents is None:
+        each = 0
+    else:
+        each = scene.tangents.shape[1] // m
     tangential = jnp.zeros((m, each), v.dtype)
-    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    code = jnp.asarray(CODE["ok"])
+    square = jnp.zeros((), v.dtype)
+    noise = jnp.zeros((), v.dtype)
     accuracy = jnp.zeros((), v.dtype)
     for padded, contacts, acts in zip(groups, batches, active):
         index = jnp.asarray(padded % m)
         acts = happens & (acts | law.pulls)
 
-        def resolve_group(index: jax.Array, contact: Contact, acts: jax.Array) -> _Resolved:
+        def resolve_group(
+            index: jax.Array, contact: Contact, acts: jax.Array
+        ) -> _Resolved:
             """The impulses of one group."""
             return _resolved(restrict_law(law, index), contact, acts)
 
@@ -443,9 +530,12 @@ def _in_groups(
         rows = part.tangential.reshape(len(at), each)
         tangential = tangential.at[at].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
-        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
+        square = square + jnp.sum(part.size**2)
+        noise = noise + jnp.sum(part.noise)
         accuracy = jnp.maximum(accuracy, jnp.max(part.accuracy))
-    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise, accuracy)
+    outcome = _Resolved(
+        p, tangential.reshape(-1), code, jnp.sqrt(square), noise, accuracy
+    )
     return outcome, happens, stored
 
 
@@ -455,7 +545,8 @@ def _signs(
     """Status code () `negative_impulse` or `inadmissible_velocity`, else `ok`.
 
     Equation: `p_j sqrt(W_jj) < -tolerance` (the impulse pulls), or
-    `gamma+_j / sqrt(W_jj) < -tolerance` at a closed contact (it still approaches) [sqrt(J)].
+    `gamma+_j / sqrt(W_jj) < -tolerance` at a closed contact (it still approaches)
+    [sqrt(J)].
     """
     root = jnp.sqrt(diagonal(contact.delassus))
     # the sign of an impulse that only undoes the rounding of v- is not judged
@@ -479,9 +570,10 @@ OutcomeT = TypeVar("OutcomeT", bound=_Outcome)
 
 
 def raise_on_failure(out: OutcomeT) -> OutcomeT:
-    """Raise a RuntimeError naming every failed impact or motion (batched or not); else return it.
+    """Raise a RuntimeError naming every failed impact or motion; else return it.
 
-    Codes that only inform (`plastic_limit`, `ill_conditioned`, `order_dependent`, ..) pass.
+    Codes that only inform (`plastic_limit`, `ill_conditioned`, `order_dependent`, ..)
+    pass.
 
     Args:
         out: what `impact` or `simulate` returned, one or a batch.

@@ -1,11 +1,22 @@
-"""The base of all laws: one method from `Contact` to impulses, and declared parameters."""
+"""The base of all laws: one method from `Contact` to impulses, and declared
+parameters.
+"""
 
 import abc
 import dataclasses
 import inspect
 import operator
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, get_args, overload
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    NamedTuple,
+    TypeVar,
+    get_args,
+    overload,
+)
 
 import equinox as eqx
 import jax
@@ -26,8 +37,9 @@ from jimpact.tools.checks import (
 )
 from jimpact.tools.status import CODE
 
-# Largest exponent of a contact force that a fit tries: a cone has 2, rough surfaces about 3. With a
-# larger one a contact is rigid almost at once, and no measured velocity determines it.
+# Largest exponent of a contact force that a fit tries: a cone has 2, rough surfaces
+# about 3. With a larger one a contact is rigid almost at once, and no measured velocity
+# determines it.
 LARGEST_EXPONENT = 5.0
 
 _KEY = "jimpact"  # of what a field declares, in its metadata
@@ -37,7 +49,9 @@ AnyLaw = TypeVar("AnyLaw", bound="Law")
 
 @jax.tree_util.register_static
 class StaticNumber(float):
-    """A float that is part of the structure of a pytree: compiled in, not differentiated."""
+    """A float that is part of the structure of a pytree: compiled in, not
+    differentiated.
+    """
 
 
 @jax.tree_util.register_static
@@ -46,7 +60,8 @@ class StaticNumbers(tuple[float, ...]):
 
 
 if TYPE_CHECKING:
-    # What a parameter takes and what it is read as; type checkers see both in such a descriptor.
+    # What a parameter takes and what it is read as; type checkers see both in such a
+    # descriptor.
     Numbers = jax.typing.ArrayLike | Sequence[Any]
     Taken = TypeVar("Taken", contravariant=True)
     Read = TypeVar("Read", covariant=True)
@@ -74,7 +89,9 @@ else:
 
 @dataclasses.dataclass(eq=False)
 class Domain:
-    """The domain that `parameter` declares of a field; equinox calls it to convert a value."""
+    """The domain that `parameter` declares of a field; equinox calls it to convert a
+    value.
+    """
 
     low: float = -np.inf
     high: float = np.inf
@@ -109,12 +126,23 @@ class Domain:
             check_square(self.name, value)
             check_values(self.name, value)
         else:
-            check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
+            check_values(
+                self.name, value, low=self.low, high=self.high, open_low=self.open_low
+            )
 
     def holds(self, value: Any) -> Any:
-        """True () where all entries are finite and in [low, high] or (low, high], on the device."""
-        low, high = (-np.inf, np.inf) if self.matrix and np.ndim(value) >= 2 else self.bounds
-        above = value > low if self.open_low else value >= low
+        """True () where all entries are finite and in [low, high] or (low, high], on
+        the device.
+        """
+        if self.matrix and np.ndim(value) >= 2:
+            low = -np.inf
+            high = np.inf
+        else:
+            low, high = self.bounds
+        if self.open_low:
+            above = value > low
+        else:
+            above = value >= low
         return jnp.all(jnp.isfinite(value) & above & (value <= high))
 
     @property
@@ -125,7 +153,9 @@ class Domain:
 
 @dataclasses.dataclass(eq=False)
 class Option:
-    """The values that `option` allows in a static field; equinox calls it to check a value."""
+    """The values that `option` allows in a static field; equinox calls it to check a
+    value.
+    """
 
     choices: tuple[Any, ...] | None = None
     low: float | None = None
@@ -141,7 +171,9 @@ class Option:
         if self.choices is not None:
             check_choice(self.name, value, self.choices)
         if self.low is not None and value is not None:
-            check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
+            check_values(
+                self.name, value, low=self.low, high=self.high, open_low=self.open_low
+            )
         return value
 
 
@@ -159,7 +191,7 @@ def parameter(
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
 ) -> Any:
-    """A field of a `Law` that is a parameter: a float array with a domain, declared once.
+    """A field of a `Law` that is a parameter: a float array with a domain.
 
     The check of the constructor, the bounds and transforms of `fit`, the random laws of
     `monte_carlo`, studies and the command line all read this declaration.
@@ -169,12 +201,14 @@ def parameter(
         high: largest value.
         open_low: exclude `low`.
         log: fit the logarithm (for a stiffness, whose order of magnitude is unknown).
-        static_numbers: a Python number or tuple is compiled in, an array is a parameter.
+        static_numbers: a Python number or tuple is compiled in, an array is a
+            parameter.
         matrix: also accept a square matrix, not checked against the bounds.
         per_contact: a scalar or one value per contact (m,), checked against the scene.
         high_unless: name of an option that, where true, lifts `high`.
-        searched_high: upper bound in fits that start below it, unless `bounds` say otherwise:
-            larger values are allowed, but no measurement could determine them.
+        searched_high: upper bound in fits that start below it, unless `bounds` say
+            otherwise: larger values are allowed, but no measurement could determine
+            them.
         default: value if the constructor gets none; may be None (no such effect).
         kw_only: the constructor takes it by keyword only.
 
@@ -182,8 +216,8 @@ def parameter(
         What a class body assigns to the field.
 
     Raises:
-        ValueError: by the law's constructor, where a value is out of the domain or of a wrong
-            shape.
+        ValueError: by the law's constructor, where a value is out of the domain or of a
+            wrong shape.
 
     >>> import jimpact as ji
     >>> class Lossy(ji.LZB):
@@ -194,7 +228,15 @@ def parameter(
     ValueError: Argument `loss` must lie in [0, 1], but has value 1.5.
     """
     declared = Domain(
-        low, high, open_low, log, static_numbers, matrix, per_contact, high_unless, searched_high
+        low,
+        high,
+        open_low,
+        log,
+        static_numbers,
+        matrix,
+        per_contact,
+        high_unless,
+        searched_high,
     )
     return _field(declared, default, kw_only, False)
 
@@ -209,7 +251,7 @@ def option(
     converter: Callable[[Any], Any] | None = None,
     kw_only: bool = True,
 ) -> Any:
-    """A static field of a `Law` for how it is solved: one of `choices`, or in an interval.
+    """A static field of a `Law`, how it is solved: one of `choices`, or in an interval.
 
     `converter` takes the place of these checks.
 
@@ -219,8 +261,8 @@ def option(
         low: smallest value; None: no limits.
         high: largest value.
         open_low: exclude `low`.
-        converter: function of the value to the stored one, which may raise a ValueError; it takes
-            the place of these checks.
+        converter: function of the value to the stored one, which may raise a
+            ValueError; it takes the place of these checks.
         kw_only: the constructor takes it by keyword only.
 
     Returns:
@@ -233,7 +275,7 @@ def option(
     >>> ji.LZB(0.9, method="euler")
     Traceback (most recent call last):
         ...
-    ValueError: Argument `method` must be one of auto, time, implicit, but has value 'euler'.
+    ValueError: Argument `method` must be one of auto, time, implicit, ...
     """
     declared = Option(choices, low, high, open_low, converter)
     return _field(declared, default, kw_only, True)
@@ -241,14 +283,23 @@ def option(
 
 def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool) -> Any:
     """The dataclass field with this declaration in its metadata."""
-    options = {} if default is dataclasses.MISSING else {"default": default}
+    if default is dataclasses.MISSING:
+        options = {}
+    else:
+        options = {"default": default}
     return eqx.field(
-        converter=declared, static=static, kw_only=kw_only, metadata={_KEY: declared}, **options
+        converter=declared,
+        static=static,
+        kw_only=kw_only,
+        metadata={_KEY: declared},
+        **options,
     )
 
 
 def _check_arguments(cls: type, *args: Any, **kwargs: Any) -> None:
-    """Raise a TypeError that lists the arguments of `cls`, where these do not fit them."""
+    """Raise a TypeError that lists the arguments of `cls`, where these do not fit
+    them.
+    """
     signature = inspect.signature(cls)
     try:
         signature.bind(*args, **kwargs)
@@ -258,7 +309,10 @@ def _check_arguments(cls: type, *args: Any, **kwargs: Any) -> None:
             for name, x in signature.parameters.items()
         )
         strange = "".join(
-            f" It has no `{word}`.{suggestion(word, signature.parameters, ABBREVIATIONS)}"
+            (
+                f" It has no "
+                f"`{word}`.{suggestion(word, signature.parameters, ABBREVIATIONS)}"
+            )
             for word in kwargs
             if word not in signature.parameters
         )
@@ -293,11 +347,15 @@ class Declared(eqx.Module, metaclass=_Signed):  # type: ignore[metaclass]
                 value.metadata[_KEY].name = name
 
     def __repr__(self) -> str:
-        """The call that makes it, with numbers; `(static)`: compiled in, never a derivative."""
+        """The call that makes it, with numbers; `(static)`: compiled in, never a
+        derivative.
+        """
         words = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            default = field.default is not dataclasses.MISSING and value is field.default
+            default = (
+                field.default is not dataclasses.MISSING and value is field.default
+            )
             if not (default and isinstance(field.metadata.get(_KEY), Option)):
                 words.append(f"{field.name}={_in_words(value)}")
         return f"{type(self).__name__}({', '.join(words)})"
@@ -320,9 +378,13 @@ def _in_words(value: Any) -> str:
         return f"{value!r} (static)"
     if eqx.is_array(value) and not is_traced(value):
         digits: Any = {"float_kind": lambda x: f"{x:.6g}"}
-        text = np.array2string(np.asarray(value), separator=", ", threshold=20, formatter=digits)
+        text = np.array2string(
+            np.asarray(value), separator=", ", threshold=20, formatter=digits
+        )
         return " ".join(text.split())
-    return eqx.tree_pformat(value) if eqx.is_array(value) else repr(value)
+    if eqx.is_array(value):
+        return eqx.tree_pformat(value)
+    return repr(value)
 
 
 class Parameter(NamedTuple):
@@ -340,39 +402,56 @@ def parameters_of(module: eqx.Module) -> dict[str, Parameter]:
     """
     parameters: dict[str, Parameter] = {}
     for field in dataclasses.fields(module):
-        value, declared = getattr(module, field.name), field.metadata.get(_KEY)
+        value = getattr(module, field.name)
+        declared = field.metadata.get(_KEY)
         if isinstance(value, Declared):
             inner = parameters_of(value)
-            parameters |= {k: x._replace(path=f"{field.name}.{x.path}") for k, x in inner.items()}
+            parameters |= {
+                k: x._replace(path=f"{field.name}.{x.path}") for k, x in inner.items()
+            }
         elif isinstance(declared, Domain):
             parameters[field.name] = Parameter(value, field.name, declared.of(module))
         elif eqx.is_inexact_array(value):
-            parameters[field.name] = Parameter(value, field.name, Domain(per_contact=False))
+            parameters[field.name] = Parameter(
+                value, field.name, Domain(per_contact=False)
+            )
     return parameters
 
 
 def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
-    """Parameters that are arrays, not None or static numbers: they can be fitted and sampled."""
-    return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
+    """Parameters that are arrays, not None or static numbers: they can be fitted and
+    sampled.
+    """
+    return {
+        k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)
+    }
 
 
 def with_parameter(module: Any, name: str, value: Any) -> Any:
     """The law with another value of one of its parameters, or of those of its parts."""
-    return eqx.tree_at(operator.attrgetter(parameters_of(module)[name].path), module, value)
+    return eqx.tree_at(
+        operator.attrgetter(parameters_of(module)[name].path), module, value
+    )
 
 
 def value_of(law: "Law", field: str) -> Any:
-    """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
+    """A parameter of a law, or of its parts (the force of a compliant one); None if it
+    has none.
+    """
     return getattr(parameters_of(law).get(field), "value", None)
 
 
 def entries(law: "Law", fields: tuple[str, ...]) -> np.ndarray:
     """All entries (Q,) of these fields of a law, one field after the other."""
-    return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
+    return np.concatenate(
+        [np.ravel(np.asarray(value_of(law, f), float)) for f in fields]
+    )
 
 
 def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
-    """The law with `values` (Q,) as the entries of these fields, one field after the other."""
+    """The law with `values` (Q,) as the entries of these fields, one field after the
+    other.
+    """
     start = 0
     for field in fields:
         old = value_of(law, field)
@@ -390,7 +469,9 @@ def within_domains(law: eqx.Module) -> jax.Array:
 
 def declarations_of(kind: type[eqx.Module]) -> dict[str, Domain | Option]:
     """The `Domain` or `Option` that each field of a class declares, by name."""
-    return {f.name: f.metadata[_KEY] for f in dataclasses.fields(kind) if _KEY in f.metadata}
+    return {
+        f.name: f.metadata[_KEY] for f in dataclasses.fields(kind) if _KEY in f.metadata
+    }
 
 
 def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
@@ -419,35 +500,42 @@ class Impulses(NamedTuple):
 class Law(Declared):
     """An impact law: parameters and the one method `impulses`.
 
-    A law is a pytree: grad of a law is a law, vmap over a law is a batch. Fields are declared with
-    `ji.parameter`; two of them mean the same in every law: `friction`, Coulomb's mu (the scene
-    must have tangents unless it is None), and `initial_energy`, stored in the contacts before the
-    impact [J]. `impact` always calls `impulses`. If no contact approaches or stores energy, it
-    passes gamma- = -1 and discards the result, so that gradients stay finite. It decouples open
-    contacts and gives them no impulse (unless `uses_gaps`), sets gap velocities within rounding to
-    0, and adds its own checks to the status (not finite, negative impulse, inadmissible velocity,
+    A law is a pytree: grad of a law is a law, vmap over a law is a batch. Fields are
+    declared with `ji.parameter`; two of them mean the same in every law: `friction`,
+    Coulomb's mu (the scene must have tangents unless it is None), and `initial_energy`,
+    stored in the contacts before the impact [J]. `impact` always calls `impulses`. If
+    no contact approaches or stores energy, it passes gamma- = -1 and discards the
+    result, so that gradients stay finite. It decouples open contacts and gives them no
+    impulse (unless `uses_gaps`), sets gap velocities within rounding to 0, and adds its
+    own checks to the status (not finite, negative impulse, inadmissible velocity,
     energy gain).
 
     A law declares what else it can do; by default it only returns impulses.
 
     Class attributes:
         uses_gaps: open contacts take part, at their gaps.
-        pulls: separating contacts take part, too, if any contact approaches or stores energy.
-        separable: contacts that W does not couple may be solved separately: the law itself couples
-            none, and its parameters are scalars or (m,).
-        pads_scenes: open contacts may be added, so that small scenes share one compiled program.
-        accuracy: relative error of v+ that it allows itself at a `Contact`; signs and energy are
-            judged beyond it.
+        pulls: separating contacts take part, too, if any contact approaches or stores
+            energy.
+        separable: contacts that W does not couple may be solved separately: the law
+            itself couples none, and its parameters are scalars or (m,).
+        pads_scenes: open contacts may be added, so that small scenes share one compiled
+            program.
+        accuracy: relative error of v+ that it allows itself at a `Contact`; signs and
+            energy are judged beyond it.
         contact_force: the `Force` of its contacts (`gap_scale`, `crossover`).
-        has_history: whether `dynamics` may be sampled over the impact's time (`history`).
-        joins_step: True if the law is Moreau's, with `restitution` and `tangential_restitution` of
-            each contact; time stepping then solves it together with the equations of motion.
-        only_stiffness_ratios: whether a common factor of all stiffnesses changes nothing (`fit`
-            then fixes the first one).
+        has_history: whether `dynamics` may be sampled over the impact's time
+            (`history`).
+        joins_step: True if the law is Moreau's, with `restitution` and
+            `tangential_restitution` of each contact; time stepping then solves it
+            together with the equations of motion.
+        only_stiffness_ratios: whether a common factor of all stiffnesses changes
+            nothing (`fit` then fixes the first one).
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
-    >>> class Plastic(ji.Law):  # all contacts of a pair of bodies stop, without friction
+    >>> class Plastic(
+    ...     ji.Law
+    ... ):  # all contacts of a pair of bodies stop, without friction
     ...     def impulses(self, contact):
     ...         w = contact.normal_delassus
     ...         return ji.Impulses(jnp.linalg.solve(w, -contact.gap_velocity))
@@ -472,7 +560,9 @@ class Law(Declared):
         """Advice for a value that is no law, ending the message of `check_kind`."""
         if isinstance(value, Scene):
             return " The law comes before the scene."
-        return " A law is an object, as ji.LZB(0.9)." if isinstance(value, str) else ""
+        if isinstance(value, str):
+            return " A law is an object, as ji.LZB(0.9)."
+        return ""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
         """The argument of `impulses`: contacts of a scene at the velocity v- (n,).
@@ -482,10 +572,14 @@ class Law(Declared):
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """To override: raise where the law does not fit the scene, or the precision `dtype`."""
+        """To override: raise where the law does not fit the scene, or the precision
+        `dtype`.
+        """
 
     def dynamics(self, contact: Contact) -> Any:
-        """To override where `has_history`: the impact dynamics at `contact` (`jimpact.events`)."""
+        """To override where `has_history`: the impact dynamics at `contact`
+        (`jimpact.events`).
+        """
         raise NotImplementedError
 
     @property
@@ -494,20 +588,25 @@ class Law(Declared):
         return None
 
     def accuracy(self, contact: Contact) -> float:
-        """Relative error of v+ at this `contact`: `impact` judges signs and energy beyond it."""
+        """Relative error of v+ at this `contact`: `impact` judges signs and energy
+        beyond it.
+        """
         return 0.0
 
     @property
     def stored(self) -> jax.Array:
         """Energy stored in the contacts before the impact, () or (m,) [J]."""
         stored = getattr(self, "initial_energy", None)
-        return jnp.zeros(()) if stored is None else stored
+        if stored is None:
+            return jnp.zeros(())
+        return stored
 
 
 def forwards_to_law(around: type[AnyLaw]) -> type[AnyLaw]:
     """Class decorator of a law around another one, its field `law`.
 
-    Members of `Law` that the class does not define itself become those of the other law.
+    Members of `Law` that the class does not define itself become those of the other
+    law.
     """
     for name in vars(Law):
         if not name.startswith("_") and name not in vars(around):
@@ -528,26 +627,39 @@ def with_option(law: AnyLaw, name: str, chosen: Any) -> AnyLaw:
     new = object.__new__(type(law))
     for field in fields:
         value = getattr(law, field.name)
-        value = with_option(value, name, chosen) if isinstance(value, Law) else value
+        if isinstance(value, Law):
+            value = with_option(value, name, chosen)
         object.__setattr__(new, field.name, chosen if field.name == name else value)
     return new
 
 
 def forward_only(law: AnyLaw) -> AnyLaw:
-    """The law, and laws within it, with `adjoint` 'forward' where they have this option."""
+    """The law, and laws within it, with `adjoint` 'forward' where they have this
+    option.
+    """
     return with_option(law, "adjoint", "forward")
 
 
 def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
-    """Raise a ValueError where parameters, or the law as a whole, do not fit the scene."""
+    """Raise a ValueError where parameters, or the law as a whole, do not fit the
+    scene.
+    """
     for name, (value, _, domain) in parameters_of(law).items():
         ndim = np.ndim(value)
-        if value is None or not domain.per_contact or ndim == 0 or (domain.matrix and ndim == 2):
+        if (
+            value is None
+            or not domain.per_contact
+            or ndim == 0
+            or (domain.matrix and ndim == 2)
+        ):
             continue
-        check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
+        check_shape(
+            name, value, (scene.contacts,), "one entry per contact, or a scalar"
+        )
     if getattr(law, "friction", None) is not None and scene.tangents is None:
         raise ValueError(
-            f"Argument `scene` must have tangents where {type(law).__name__} has `friction`: "
+            f"Argument `scene` must have tangents where {type(law).__name__} has "
+            f"`friction`: "
             "give Scene(..., tangents=...), or friction=None."
         )
     law.check(scene, dtype)
@@ -566,5 +678,9 @@ def is_separable(law: Law) -> bool:
 
 
 def restrict_law(law: Law, contacts: jax.Array) -> Law:
-    """The law of the contacts with these indices (k,): their entries of parameters (m,)."""
-    return jax.tree.map(lambda x: x[contacts] if eqx.is_array(x) and x.ndim == 1 else x, law)
+    """The law of the contacts with these indices (k,): their entries of parameters
+    (m,).
+    """
+    return jax.tree.map(
+        lambda x: x[contacts] if eqx.is_array(x) and x.ndim == 1 else x, law
+    )

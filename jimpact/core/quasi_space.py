@@ -1,4 +1,6 @@
-"""A basis of velocities normal and tangential to the contacts, in the kinetic metric."""
+"""A basis of velocities normal and tangential to the contacts, in the kinetic
+metric.
+"""
 
 from functools import partial
 
@@ -13,9 +15,9 @@ from jimpact.tools.checks import is_traced
 from jimpact.tools.compiling import quick_jit
 from jimpact.tools.precision import precision
 
-# Relative difference below which shares of coordinates in the tangent space count as equal: the
-# first one is taken, so that a basis does not depend on the last digit. Ten times more would take
-# coordinates that span the space less well.
+# Relative difference below which shares of coordinates in the tangent space count as
+# equal: the first one is taken, so that a basis does not depend on the last digit. Ten
+# times more would take coordinates that span the space less well.
 _EQUAL_SHARE = 1e-3
 
 _REDUNDANT = (
@@ -27,13 +29,15 @@ _REDUNDANT = (
 def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     """Bases `n_q` (n, m) and `t_q` (n, n - m - b) of the kinetic quasi-velocities.
 
-    Equation: `n_q = M^-1 N diag(1 / |grad f_j|)`, `t_q^T M n_q = 0`, `t_q^T grad h = 0`,
+    Equation: `n_q = M^-1 N diag(1 / |grad f_j|)`, `t_q^T M n_q = 0`,
+    `t_q^T grad h = 0`,
     `t_q^T M t_q = I` (so that `D_t = I`).
 
-    Column i of t_q comes from a coordinate: the n - m - b coordinates with the largest shares
-    (in the kinetic metric) in the tangent space are projected onto it and orthonormalized in
-    their order; each column forms an acute angle with what is left of its coordinate. A chain
-    without walls: `(1, ..., 1) / sqrt(sum m)`.
+    Column i of t_q comes from a coordinate: the n - m - b coordinates with the largest
+    shares
+    (in the kinetic metric) in the tangent space are projected onto it and
+    orthonormalized in their order; each column forms an acute angle with what is left
+    of its coordinate. A chain without walls: `(1, ..., 1) / sqrt(sum m)`.
 
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
@@ -42,7 +46,8 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
         n_q [1 / sqrt(kg)], t_q [1 / sqrt(kg)].
 
     Raises:
-        ValueError: redundant contacts, whose n_q are not independent (NaN or noise if traced).
+        ValueError: redundant contacts, whose n_q are not independent (NaN or noise if
+            traced).
 
     Differentiable in the scene, but for the moments when another coordinate takes over.
 
@@ -50,7 +55,10 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
     >>> import jimpact as ji
     >>> normal, tangent = ji.theory.quasi_basis(ji.chain([2.0, 2.0]))
-    >>> [round(float(x), 6) for x in normal[:, 0]], [round(float(x), 6) for x in tangent[:, 0]]
+    >>> (
+    ...     [round(float(x), 6) for x in normal[:, 0]],
+    ...     [round(float(x), 6) for x in tangent[:, 0]],
+    ... )
     ([-0.5, 0.5], [0.5, 0.5])
     """
     check_independent(scene)
@@ -59,16 +67,21 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
 @quick_jit
 def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    """n_q (n, m) and t_q (n, k), k = n - m - b, of a scene whose contacts are independent.
+    """n_q (n, m) and t_q (n, k), k = n - m - b, of a scene whose contacts are
+    independent.
 
     Equation: with D = (N, grad h) and its unit columns `n = M^-1 D diag(1 / |D_j|)`,
-    `G = n^T M n`, the projector on the tangent space is `P = I - n G^-1 n^T M`; t_q are k columns
-    of P (see `_coordinates`), orthonormalized in the metric of M by Cholesky's factorization.
+    `G = n^T M n`, the projector on the tangent space is `P = I - n G^-1 n^T M`; t_q are
+    k columns of P (see `_coordinates`), orthonormalized in the metric of M by
+    Cholesky's factorization.
     """
     all_contacts = _with_constraints_as_contacts(scene)
     metric = jax.vmap(partial(momentum, scene), 1, 1)  # M X
     gram = as_matrix(normalized_delassus(all_contacts))
-    unit = jnp.eye(all_contacts.contacts, dtype=gram.dtype) / kinetic_norm(all_contacts)[:, None]
+    unit = (
+        jnp.eye(all_contacts.contacts, dtype=gram.dtype)
+        / kinetic_norm(all_contacts)[:, None]
+    )
     normal = jax.vmap(partial(velocity_change, all_contacts), 1, 1)(unit)
     identity = jnp.eye(scene.size, dtype=gram.dtype)
     projector = identity - normal @ jnp.linalg.solve(gram, metric(normal).T)
@@ -80,7 +93,8 @@ def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
 
 def _with_constraints_as_contacts(scene: Scene) -> Scene:
-    """The scene whose normals are (N, grad h) (n, m + b): constraints are further contacts.
+    """The scene whose normals are (N, grad h) (n, m + b): constraints are further
+    contacts.
 
     Raise a ValueError for more of them than velocities.
     """
@@ -94,10 +108,11 @@ def _with_constraints_as_contacts(scene: Scene) -> Scene:
 
 
 def check_independent(scene: Scene) -> None:
-    """Raise a ValueError where contact normals and constraints are dependent (if concrete).
+    """Raise a ValueError where contact normals and constraints are dependent (if
+    concrete).
 
-    They are where the least eigenvalue of their Gram matrix D^T M^-1 D, with a unit diagonal, is
-    rounding.
+    They are where the least eigenvalue of their Gram matrix D^T M^-1 D, with a unit
+    diagonal, is rounding.
     """
     all_contacts = _with_constraints_as_contacts(scene)
     if is_traced((all_contacts.normals, all_contacts.mass)):
@@ -108,29 +123,39 @@ def check_independent(scene: Scene) -> None:
     smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
     if smallest < precision(gram.dtype).singular * len(gram):
         raise ValueError(
-            _REDUNDANT.format(f"redundant ones: smallest eigenvalue of G {smallest:.3g}")
+            _REDUNDANT.format(
+                f"redundant ones: smallest eigenvalue of G {smallest:.3g}"
+            )
         )
 
 
 def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
     """Indices (count,), ascending, of the coordinates that span the tangent space best.
 
-    Pivots of the Cholesky factorization of the Gram matrix of the projected coordinate directions,
-    of unit length in the metric of M = `mass` (n, n); `shares` is M P (n, n), P the projector on
-    the tangent space.
+    Pivots of the Cholesky factorization of the Gram matrix of the projected coordinate
+    directions, of unit length in the metric of M = `mass` (n, n); `shares` is M P (n,
+    n), P the projector on the tangent space.
     """
     if count == 0:
         return jnp.zeros(0, jnp.int32)
     scale = 1 / jnp.sqrt(jnp.diagonal(mass))
     gram = jax.lax.stop_gradient(shares * scale[:, None] * scale[None, :])
 
-    def choose(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """The Gram matrix without the direction of the next pivot, and pivots (count,) so far."""
+    def choose(
+        i: jax.Array, state: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        """The Gram matrix without the direction of the next pivot, and pivots (count,)
+        so far.
+        """
         rest, chosen = state
         squares = jnp.diagonal(rest)  # of what no chosen direction spans
-        pivot = jnp.argmax(squares >= (1 - _EQUAL_SHARE) * jnp.max(squares)).astype(jnp.int32)
+        pivot = jnp.argmax(squares >= (1 - _EQUAL_SHARE) * jnp.max(squares)).astype(
+            jnp.int32
+        )
         column = rest[:, pivot]
-        return rest - jnp.outer(column, column) / squares[pivot], chosen.at[i].set(pivot)
+        return rest - jnp.outer(column, column) / squares[pivot], chosen.at[i].set(
+            pivot
+        )
 
     start = (gram, jnp.zeros(count, jnp.int32))
     return jnp.sort(jax.lax.fori_loop(0, count, choose, start)[1])

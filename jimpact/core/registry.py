@@ -15,8 +15,8 @@ EVERY_PROPERTY = frozenset(
 class Row(NamedTuple):
     """A registered law, what it promises on every scene, and where it comes from.
 
-    `promises` names the properties the contract suite holds it to; where the law breaks another
-    one of them, its status must say so.
+    `promises` names the properties the contract suite holds it to; where the law breaks
+    another one of them, its status must say so.
     """
 
     law: type[Law]
@@ -26,7 +26,8 @@ class Row(NamedTuple):
     promises: frozenset[str]
     source: str
     bibtex: str
-    make: Callable[..., Law] | None = None  # from plain numbers, where the class takes others
+    # from plain numbers, where the class takes others
+    make: Callable[..., Law] | None = None
     simplicity: float | None = None  # place in the order of `simplest_first`
 
     @property
@@ -46,8 +47,12 @@ class Row(NamedTuple):
 
     @property
     def in_python(self) -> str:
-        """The call of the class as text, without options: studies may give other parameters."""
-        names = [x for x in inspect.signature(self.law).parameters if x not in self.options]
+        """The call of the class as text, without options: studies may give other
+        parameters.
+        """
+        names = [
+            x for x in inspect.signature(self.law).parameters if x not in self.options
+        ]
         return f"ji.{self.law.__name__}({', '.join(names)})"
 
     @property
@@ -68,14 +73,19 @@ ADVISED = ("restitution", "stiffness", "exponent", "friction", "tangential_stiff
 
 
 def simplest_first() -> tuple[str, ...]:
-    """Names of the laws that `advise` tries: first those that need to know least of the contacts.
+    """Names of the laws that `advise` tries: first those that need to know least of the
+    contacts.
 
     >>> import jimpact as ji
     >>> from jimpact.core.registry import simplest_first
     >>> "newton" in ji.REGISTRY and simplest_first()[0]
     'newton'
     """
-    places = {name: row.simplicity for name, row in REGISTRY.items() if row.simplicity is not None}
+    places = {
+        name: row.simplicity
+        for name, row in REGISTRY.items()
+        if row.simplicity is not None
+    }
     return tuple(sorted(places, key=lambda name: places[name]))
 
 
@@ -92,25 +102,26 @@ def register(
     make: Callable[..., Law] | None = None,
     simplicity: float | None = None,
 ) -> Any:
-    """Enter a law in `ji.REGISTRY`: then `compare`, studies and the command line know it by name.
+    """Enter a law in `ji.REGISTRY`, where `compare`, studies and the CLI find it.
 
     Args:
         name: in small letters; what a study calls it.
         law: the class; None: `register` is used as a decorator of it.
         summary, right_when, fails_when: a line each, for `jimpact laws`.
-        promises: properties it keeps on every scene, of 'impulse_sign', 'gap_velocity_sign',
-            'energy', 'velocity_scaling', 'mass_scaling'.
+        promises: properties it keeps on every scene, of 'impulse_sign',
+            'gap_velocity_sign', 'energy', 'velocity_scaling', 'mass_scaling'.
         source, bibtex: where it comes from.
         make: builds it from plain numbers, where the class takes other things.
-        simplicity: place in the order in which `advise` tries laws, the simplest first: newton 1,
-            moreau 2, poisson 3, binary 4, lzb 5, compliant 6; None: `advise` leaves it out.
+        simplicity: place in the order in which `advise` tries laws, the simplest first:
+            newton 1, moreau 2, poisson 3, binary 4, lzb 5, compliant 6; None: `advise`
+            leaves it out.
 
     Returns:
         The class, or the decorator.
 
     Raises:
-        TypeError: no Law. ValueError: a name that another law has, an unknown promise, a law that
-            `advise` cannot make.
+        TypeError: no Law. ValueError: a name that another law has, an unknown promise,
+            a law that `advise` cannot make.
 
     >>> import jimpact as ji
     >>> @ji.register("gentle", summary="half of Newton's impulse")
@@ -130,13 +141,16 @@ def register(
         if not (isinstance(law, type) and issubclass(law, Law)):
             raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
         if name != name.lower() or not name:
-            raise ValueError(f"Argument `name` must be in small letters, but has value {name!r}.")
+            raise ValueError(
+                f"Argument `name` must be in small letters, but has value {name!r}."
+            )
         for promise in promises:
             check_choice("promises", promise, sorted(EVERY_PROPERTY))
         other = REGISTRY.get(name)  # of the same place: a module that is read again
         if other is not None and _place(other.law) != _place(law):
             raise ValueError(
-                f"Argument `name` must be new, but {name!r} is {other.law.__qualname__} of "
+                f"Argument `name` must be new, but {name!r} is "
+                f"{other.law.__qualname__} of "
                 f"{other.law.__module__}."
             )
         row = Row(
@@ -153,13 +167,16 @@ def register(
         unknown = [key for key in row.required if key not in ADVISED]
         if simplicity is not None and unknown:
             raise ValueError(
-                f"Argument `simplicity` must be None for a law that needs `{unknown[0]}`: `advise` "
+                f"Argument `simplicity` must be None for a law that needs "
+                f"`{unknown[0]}`: `advise` "
                 f"knows only {', '.join(ADVISED)}."
             )
         REGISTRY[name] = row
         return law
 
-    return enter if law is None else enter(law)
+    if law is None:
+        return enter
+    return enter(law)
 
 
 def _place(law: type[Law]) -> tuple[str, str]:
@@ -170,27 +187,34 @@ def _place(law: type[Law]) -> tuple[str, str]:
 def registered_laws(
     values: Mapping[str, Any], names: Iterable[str] | None = None
 ) -> tuple[dict[str, Law], dict[str, str]]:
-    """Laws by name, made from `values` of parameters by name, and the reasons others are left out.
+    """Laws by name, made from `values` of parameters by name, and the reasons others
+    are left out.
 
-    `names`: those in the registry to make, in this order; None: all. A law without a value for a
-    required parameter is left out. Raise a ValueError for a parameter that no law has.
+    `names`: those in the registry to make, in this order; None: all. A law without a
+    value for a required parameter is left out. Raise a ValueError for a parameter that
+    no law has.
 
     >>> import jimpact as ji
     >>> from jimpact.core.registry import registered_laws
     >>> assert ji.REGISTRY  # our own laws are registered where they are imported
     >>> laws, left_out = registered_laws({"restitution": 0.9})
-    >>> laws["newton"], left_out["restitution_matrix"]
-    (Newton(restitution=0.9, friction=None, tangential_restitution=None), 'needs `matrix`')
+    >>> laws["newton"]
+    Newton(restitution=0.9, friction=None, tangential_restitution=None)
+    >>> left_out["restitution_matrix"]
+    'needs `matrix`'
     """
     taken = sorted({key for row in REGISTRY.values() for key in row.arguments})
     for key in values:
         check_word("A parameter of laws", key, taken)
-    laws, left_out = {}, {}
+    laws = {}
+    left_out = {}
     for name in REGISTRY if names is None else names:
         row = REGISTRY[name]
         missing = [f"`{key}`" for key in row.required if key not in values]
         if missing:
             left_out[name] = f"needs {', '.join(missing)}"
         else:
-            laws[name] = row.build(**{key: values[key] for key in row.arguments if key in values})
+            laws[name] = row.build(
+                **{key: values[key] for key in row.arguments if key in values}
+            )
     return laws, left_out

@@ -5,9 +5,11 @@
 #   M                mass matrix (n, n)                          [kg]
 #   N = grad f       normals (n, m), one column a contact
 #   gamma = N^T v    gap velocities (m,); < 0 on approach        [m/s]
-#   p                contact impulses (m,), >= 0                 [N s];  v+ = v- + M^-1 N p
+#   p                contact impulses (m,), >= 0                 [N s];  v+ = v- + M^-1
+N p
 #   W = N^T M^-1 N   Delassus matrix (m, m);  gamma+ = gamma- + W p
-#   G                W scaled to a unit diagonal;  cos(theta_ij) = -G_ij (kinetic angles)
+#   G                W scaled to a unit diagonal;  cos(theta_ij) = -G_ij (kinetic
+angles)
 #   T = v^T M v / 2  kinetic energy                              [J]
 """
 
@@ -37,21 +39,22 @@ from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision
 from jimpact.tools.records import counted
 
-# Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
-# would accept a mass matrix with a wrong fourth digit.
+# Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten
+# times more would accept a mass matrix with a wrong fourth digit.
 _SYMMETRY_TOLERANCE = 1e-6
 
-# Part of the length of a normal by which tangents may miss right angles, or its length, before a
-# warning. Ten times more would pass a tilt of half a degree.
+# Part of the length of a normal by which tangents may miss right angles, or its length,
+# before a warning. Ten times more would pass a tilt of half a degree.
 _ORTHONORMAL_WITHIN = 1e-3
 
-# Least eigenvalue of the products of a contact's directions, of length 1 in the metric of the mass,
-# below which they depend on each other. Ten times more reports bodies that turn very easily.
+# Least eigenvalue of the products of a contact's directions, of length 1 in the metric
+# of the mass, below which they depend on each other. Ten times more reports bodies that
+# turn very easily.
 _DEPENDENT = 1e-13
 
-# Gaps smaller than this [m], of either sign, are the rounding of the positions that they were
-# computed from, and closed: it is a hundredth of an atom, and positions of up to 1 km are rounded
-# by less. Ten times more would still be less than an atom.
+# Gaps smaller than this [m], of either sign, are the rounding of the positions that
+# they were computed from, and closed: it is a hundredth of an atom, and positions of up
+# to 1 km are rounded by less. Ten times more would still be less than an atom.
 GAP_ROUNDING = 1e-12
 
 _CONSTRAINTS = operator.attrgetter("constraints")
@@ -65,9 +68,11 @@ WALLS = {
 
 
 class PairNormals(eqx.Module):
-    """Normals of contacts between two bodies of d velocities each: `directions` (m, 2, d).
+    """Normals of contacts between two bodies of d velocities each: `directions` (m, 2,
+    d).
 
-    The other entries of `grad f` are 0 and not stored. Body -1 is none: it has the direction 0.
+    The other entries of `grad f` are 0 and not stored. Body -1 is none: it has the
+    direction 0.
     """
 
     directions: jax.Array
@@ -92,26 +97,34 @@ class PairNormals(eqx.Module):
         forces = (self.directions * p[:, None, None]).reshape(-1, d)
         bodies = self.neighbours.bodies.reshape(-1)
         return (
-            jnp.zeros((self.neighbours.count, d), forces.dtype).at[bodies].add(forces).reshape(-1)
+            jnp.zeros((self.neighbours.count, d), forces.dtype)
+            .at[bodies]
+            .add(forces)
+            .reshape(-1)
         )
 
     @full_precision
     def delassus(self, mass: jax.Array) -> Sparse:
         """W = N^T M^-1 N [1/kg] for a diagonal M = `mass` (n,).
 
-        Equation: `W_jk = sum d_js . d_kt / m` over bodies s of contact j that are body t of contact
-        k, d_js the direction of contact j at its body s.
+        Equation: `W_jk = sum d_js . d_kt / m` over bodies s of contact j that are body
+        t of contact k, d_js the direction of contact j at its body s.
         """
         moved = self.directions / self._at_bodies(mass)  # M^-1 N
-        table, shared = self.neighbours.of_contacts, self.neighbours.shared
+        table = self.neighbours.of_contacts
+        shared = self.neighbours.shared
         # (contact, neighbour, own body, the neighbour's body)
         products = jnp.einsum("msd,mktd->mkst", moved, self.directions[table])
         entries = jnp.sum(jnp.where(shared, products, 0.0), axis=(2, 3))
-        return Sparse(jnp.sum(moved * self.directions, axis=(1, 2)), entries, self.neighbours)
+        return Sparse(
+            jnp.sum(moved * self.directions, axis=(1, 2)), entries, self.neighbours
+        )
 
     def dense(self) -> jax.Array:
         """N (n, m)."""
-        return jax.vmap(self.push)(jnp.eye(len(self.directions), dtype=self.directions.dtype)).T
+        return jax.vmap(self.push)(
+            jnp.eye(len(self.directions), dtype=self.directions.dtype)
+        ).T
 
 
 class Scene(eqx.Module):
@@ -120,17 +133,20 @@ class Scene(eqx.Module):
     Equation: `gamma = N^T v`, `W = N^T M^-1 N` with `N = grad f(q)`.
 
     Args:
-        mass: `(n, n)` symmetric positive definite, or `(n,)` its diagonal [kg, kg m^2, ...].
+        mass: `(n, n)` symmetric positive definite, or `(n,)` its diagonal [kg, kg m^2,
+            ...].
         normals: `(n, m)`, column j is the gradient of gap function j.
-        tangents: `(n, m)` planar or `(n, 2 m)`, contact-major; None: no friction possible.
-        gaps: `(m,)` >= 0 [m]; a contact with gap > 0 is open. Sizes below 1e-12 m, of either sign,
-            are the rounding of positions and become 0. None: all closed.
+        tangents: `(n, m)` planar or `(n, 2 m)`, contact-major; None: no friction
+            possible.
+        gaps: `(m,)` >= 0 [m]; a contact with gap > 0 is open. Sizes below 1e-12 m, of
+            either sign, are the rounding of positions and become 0. None: all closed.
         constraints: `(n, b)` gradients of bilateral constraints h(q) = 0, or None.
 
     Raises:
         ValueError: wrong shapes, NaN, mass not symmetric or not positive, negative gap,
-            a normal that is zero. A warning says where the directions of a contact depend on each
-            other, and, where the mass shows it, are not at right angles and of one length.
+            a normal that is zero. A warning says where the directions of a contact
+            depend on each other, and, where the mass shows it, are not at right angles
+            and of one length.
 
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
 
@@ -158,11 +174,18 @@ class Scene(eqx.Module):
         """Set the fields, arrays of floats, and check shapes and values."""
         self.mass = as_float_array("mass", mass)
         self._normals = as_float_array("normals", normals)
-        self.tangents = None if tangents is None else as_float_array("tangents", tangents)
-        self.gaps = None if gaps is None else rounded_gaps(gaps)
-        self.constraints = (
-            None if constraints is None else as_float_array("constraints", constraints)
-        )
+        if tangents is None:
+            self.tangents = None
+        else:
+            self.tangents = as_float_array("tangents", tangents)
+        if gaps is None:
+            self.gaps = None
+        else:
+            self.gaps = rounded_gaps(gaps)
+        if constraints is None:
+            self.constraints = None
+        else:
+            self.constraints = as_float_array("constraints", constraints)
         self.walls = None
         _check_scene(self)
 
@@ -170,7 +193,9 @@ class Scene(eqx.Module):
     def _instead_of(value: Any) -> str:
         """Advice for a value that is no scene, ending the message of `check_kind`."""
         body = callable(getattr(value, "scene", None))
-        return " A body has a scene at each configuration: `.scene(q)`." if body else ""
+        if body:
+            return " A body has a scene at each configuration: `.scene(q)`."
+        return ""
 
     def __str__(self) -> str:
         """Lines with the sizes n and m, masses, normals and gaps."""
@@ -180,10 +205,18 @@ class Scene(eqx.Module):
             kind = "chain" + (f" (wall: {walls})" if any(self.walls) else "")
         size = counted(self.size, "velocity", "velocities")
         lines = [f"{kind} of {size} and {counted(self.contacts, 'contact')}"]
-        mass = self.mass if self.mass.ndim == 1 else jnp.diagonal(self.mass, axis1=-2, axis2=-1)
-        lines.append(f"mass     {in_numbers(mass)}{'' if self.mass.ndim == 1 else ' (diagonal)'}")
+        if self.mass.ndim == 1:
+            mass = self.mass
+        else:
+            mass = jnp.diagonal(self.mass, axis1=-2, axis2=-1)
+        lines.append(
+            f"mass     {in_numbers(mass)}{'' if self.mass.ndim == 1 else ' (diagonal)'}"
+        )
         if self.walls is None and self.pairs is None:
-            lines += [f"normal {j + 1} {in_numbers(n)}" for j, n in enumerate(self.normals.T[:6])]
+            lines += [
+                f"normal {j + 1} {in_numbers(n)}"
+                for j, n in enumerate(self.normals.T[:6])
+            ]
         if self.gaps is not None:
             lines.append(f"gaps     {in_numbers(self.gaps)} m")
         return "\n".join(lines)
@@ -198,12 +231,18 @@ class Scene(eqx.Module):
         """Number m of contacts."""
         if self.walls is not None:
             return self.size - 1 + sum(self.walls)
-        return len(self.pairs.directions) if self.pairs else self.normals.shape[1]
+        if self.pairs:
+            return len(self.pairs.directions)
+        return self.normals.shape[1]
 
     @property
     def pairs(self) -> PairNormals | None:
-        """Its normals, where only those of two bodies each are stored (`sparse_scene`)."""
-        return self._normals if isinstance(self._normals, PairNormals) else None
+        """Its normals, where only those of two bodies each are stored
+        (`sparse_scene`).
+        """
+        if isinstance(self._normals, PairNormals):
+            return self._normals
+        return None
 
     @property
     def normals(self) -> jax.Array:
@@ -215,9 +254,12 @@ class Scene(eqx.Module):
         assert self.walls is not None
         left, _ = self.walls
         body = np.arange(self.size)[:, None]
-        first = np.arange(self.contacts)[None, :] - int(left)  # body on the contact's left
+        # body on the contact's left
+        first = np.arange(self.contacts)[None, :] - int(left)
         dtype = self.mass.dtype
-        return jnp.asarray((body == first + 1).astype(dtype) - (body == first).astype(dtype))
+        return jnp.asarray(
+            (body == first + 1).astype(dtype) - (body == first).astype(dtype)
+        )
 
     @property
     def closed(self) -> jax.Array:
@@ -230,20 +272,21 @@ class Scene(eqx.Module):
 def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     """A row of bodies along +x; contact j joins bodies j and j+1.
 
-    Equation: `gamma_j = v_{j+1} - v_j`; at a wall on the right `gamma_m = -v_n`, on the left
-    `gamma_1 = v_1`. The Delassus matrix is tridiagonal and never formed densely.
+    Equation: `gamma_j = v_{j+1} - v_j`; at a wall on the right `gamma_m = -v_n`, on the
+    left `gamma_1 = v_1`. The Delassus matrix is tridiagonal and never formed densely.
 
     Args:
         masses: (n,) > 0 [kg].
         wall: False; True or 'right': last contact; 'left': first contact; 'both'.
-        gaps: (m,) >= 0 [m]; sizes below 1e-12 m, of either sign, are the rounding of positions and
-            become 0. None: all closed.
+        gaps: (m,) >= 0 [m]; sizes below 1e-12 m, of either sign, are the rounding of
+            positions and become 0. None: all closed.
 
     Returns:
         `Scene` of n coordinates; m = n - 1 contacts, and one for each wall.
 
     Raises:
-        ValueError: masses or gaps out of range or of wrong shape, unknown wall, no contact.
+        ValueError: masses or gaps out of range or of wrong shape, unknown wall, no
+            contact.
 
     >>> import jimpact as ji
     >>> ji.chain([1.0, 1.0, 1.0], wall=True).contacts
@@ -252,7 +295,9 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     check_choice("wall", wall, tuple(WALLS))
     mass = as_float_array("masses", masses)
     if mass.ndim != 1:
-        raise ValueError(f"Argument `masses` must have shape (n,), but has shape {mass.shape}.")
+        raise ValueError(
+            f"Argument `masses` must have shape (n,), but has shape {mass.shape}."
+        )
     check_values("masses", mass, low=0.0, open_low=True)
     left, right = WALLS[wall]
     contacts = mass.shape[0] - 1 + left + right
@@ -279,7 +324,9 @@ def rounded_gaps(gaps: Any) -> jax.Array:
     if not is_traced(gaps):  # also inside jit, where known gaps stay known
         known = np.asarray(gaps)
         small = np.abs(known) < GAP_ROUNDING
-        return jnp.asarray(np.where(small, known.dtype.type(0), known)) if small.any() else gaps
+        if small.any():
+            return jnp.asarray(np.where(small, known.dtype.type(0), known))
+        return gaps
     rounding = jnp.where(jnp.abs(gaps) < GAP_ROUNDING, gaps, 0.0)
     return gaps - jax.lax.stop_gradient(rounding)
 
@@ -291,21 +338,26 @@ def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
 
 
 def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
-    """The scenes padded to one number of contacts and of coordinates, and how many are added.
+    """The scenes padded to one number of contacts and of coordinates, and how many are
+    added.
 
-    Scenes with fewer contacts than the largest one get open contacts, each with coordinates of its
-    own at the end: where these move at unit speed, the contact separates. Equal ones stay as they
-    are.
+    Scenes with fewer contacts than the largest one get open contacts, each with
+    coordinates of its own at the end: where these move at unit speed, the contact
+    separates. Equal ones stay as they are.
 
     Raises:
-        ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
-            coordinates or constraints.
+        ValueError: tangents in some scenes only, planar and spatial ones, or other
+            numbers of coordinates or constraints.
     """
     structures = [jax.tree.flatten(s) for s in scenes]
     if len({(tree, tuple(map(np.shape, leaves))) for leaves, tree in structures}) == 1:
         return list(scenes), 0
-    tangents = {0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes}
-    constraints = {0 if s.constraints is None else s.constraints.shape[1] for s in scenes}
+    tangents = {
+        0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes
+    }
+    constraints = {
+        0 if s.constraints is None else s.constraints.shape[1] for s in scenes
+    }
     sizes = {s.size for s in scenes}
     for what, numbers in (
         ("tangents a contact", tangents),
@@ -314,45 +366,69 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
     ):
         if len(numbers) > 1:
             raise ValueError(
-                f"Argument `scenes` must have equally many {what} in all shots, but have "
+                f"Argument `scenes` must have equally many {what} in all shots, but "
+                f"have "
                 f"{' and '.join(map(str, sorted(numbers)))}."
             )
     (each,) = tangents  # of a contact
     most = max(s.contacts for s in scenes)
-    extra = (most - min(s.contacts for s in scenes)) * (1 + each)  # a coordinate for each direction
+    # a coordinate for each direction
+    extra = (most - min(s.contacts for s in scenes)) * (1 + each)
     dense = any(s.mass.ndim == 2 for s in scenes)
     return [_with_open_contacts(s, most, s.size + extra, dense) for s in scenes], extra
 
 
-def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool) -> Scene:
-    """The scene padded on the host to a number of `contacts` and of coordinates (`size`).
+def _with_open_contacts(
+    scene: Scene, contacts: int, size: int, dense_mass: bool
+) -> Scene:
+    """The scene padded on the host to a number of `contacts` and of coordinates
+    (`size`).
 
-    The contacts that are added come last and are open. Each has a coordinate of its own for each
-    direction, of mass 1; their W_jj is that of the last contact (without constraints), so that they
-    do not change units and tolerances. With `dense_mass` M is (n, n) in any case.
+    The contacts that are added come last and are open. Each has a coordinate of its own
+    for each direction, of mass 1; their W_jj is that of the last contact (without
+    constraints), so that they do not change units and tolerances. With `dense_mass` M
+    is (n, n) in any case.
     """
-    n, m, missing = scene.size, scene.contacts, contacts - scene.contacts
-    mass, normals = np.asarray(scene.mass), np.asarray(scene.normals)
+    n = scene.size
+    m = scene.contacts
+    missing = contacts - scene.contacts
+    mass = np.asarray(scene.mass)
+    normals = np.asarray(scene.normals)
     last = normals[:, -1]
-    moved = last / mass if mass.ndim == 1 else np.linalg.solve(mass, last)
-    columns = np.sqrt(last @ moved) * np.eye(size, dtype=mass.dtype)[:, n:]  # added directions
+    if mass.ndim == 1:
+        moved = last / mass
+    else:
+        moved = np.linalg.solve(mass, last)
+    # added directions
+    columns = np.sqrt(last @ moved) * np.eye(size, dtype=mass.dtype)[:, n:]
     if dense_mass or mass.ndim == 2:
         padded_mass = np.eye(size, dtype=mass.dtype)
-        padded_mass[:n, :n] = np.diag(mass) if mass.ndim == 1 else mass
+        if mass.ndim == 1:
+            padded_mass[:n, :n] = np.diag(mass)
+        else:
+            padded_mass[:n, :n] = mass
     else:
         padded_mass = np.pad(mass, (0, size - n), constant_values=1)
 
     def padded(matrix: Any, first: int, count: int) -> np.ndarray:
-        """A matrix (n, k) with rows of 0 below, and `count` added directions from `first` on."""
+        """A matrix (n, k) with rows of 0 below, and `count` added directions from
+        `first` on.
+        """
         above = np.pad(np.asarray(matrix), ((0, size - n), (0, 0)))
         return np.concatenate([above, columns[:, first : first + count]], axis=1)
 
-    tangents, constraints = scene.tangents, scene.constraints
-    tangents_missing = 0 if tangents is None else missing * (tangents.shape[1] // m)
+    tangents = scene.tangents
+    constraints = scene.constraints
+    if tangents is None:
+        tangents_missing = 0
+    else:
+        tangents_missing = missing * (tangents.shape[1] // m)
     return _unchecked(
         mass=padded_mass,
         _normals=padded(scene.normals, 0, missing),
-        tangents=None if tangents is None else padded(tangents, missing, tangents_missing),
+        tangents=None
+        if tangents is None
+        else padded(tangents, missing, tangents_missing),
         gaps=_padded_gaps(scene, missing),
         constraints=None if constraints is None else padded(constraints, 0, 0),
     )
@@ -361,7 +437,10 @@ def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool
 def _padded_gaps(scene: Scene, missing: int) -> Any:
     """Gaps of the scene, and of 1 m at `missing` contacts after them."""
     gaps = np.ones(scene.contacts + missing, scene.mass.dtype)
-    gaps[: scene.contacts] = 0.0 if scene.gaps is None else scene.gaps
+    if scene.gaps is None:
+        gaps[: scene.contacts] = 0.0
+    else:
+        gaps[: scene.contacts] = scene.gaps
     return gaps
 
 
@@ -375,21 +454,25 @@ class PaddedScene(NamedTuple):
 
 
 def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
-    """The scene with a number of `contacts`, on the host: scenes of many sizes share programs.
+    """The scene with a number of `contacts`, on the host: scenes of many sizes share
+    programs.
 
-    A chain stays a chain, with bodies added at one end that repeat its masses there; other scenes
-    get coordinates of their own for the contacts that are added.
+    A chain stays a chain, with bodies added at one end that repeat its masses there;
+    other scenes get coordinates of their own for the contacts that are added.
     """
-    n, m = scene.size, scene.contacts
+    n = scene.size
+    m = scene.contacts
     missing = contacts - m
     copied = np.minimum(np.arange(contacts), m - 1)
     if scene.walls is None:
-        size = -(-(n + missing) // contacts) * contacts  # a multiple: few shapes, few programs
+        # a multiple: few shapes, few programs
+        size = -(-(n + missing) // contacts) * contacts
         padded = _with_open_contacts(scene, contacts, size, False)
         return PaddedScene(padded, slice(n), slice(m), copied)
     mass: Any = np.asarray(scene.mass)
     gaps = _padded_gaps(scene, missing)
-    if scene.walls[1]:  # bodies are added on the left, as the chain must end at its right wall
+    # bodies are added on the left, as the chain must end at its right wall
+    if scene.walls[1]:
         mass = np.concatenate([np.resize(mass[1::-1], missing)[::-1], mass])
         padded = chain_scene(mass, scene.walls, np.roll(gaps, missing))
         inside = slice(missing, None)
@@ -399,7 +482,9 @@ def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
 
 
 def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
-    """`velocity` as an array; raise a ValueError unless it has one (finite) entry a coordinate."""
+    """`velocity` as an array; raise a ValueError unless it has one (finite) entry a
+    coordinate.
+    """
     check_kind("scene", scene, Scene)
     v = as_float_array("velocity", velocity)
     meaning = "one per coordinate of the scene"
@@ -412,19 +497,22 @@ def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
 
 
 def velocity_unit(scene: Scene) -> str:
-    """Unit of the velocities: m/s of a chain; those of other scenes may be angular, too.
+    """Unit of the velocities: m/s of a chain; those of other scenes may be angular,
+    too.
 
     >>> import jimpact as ji
     >>> from jimpact.core import velocity_unit
     >>> velocity_unit(ji.chain([1.0, 1.0])), velocity_unit(ji.Block(0.2, 0.6).scene())
     ('m/s', 'm/s, or rad/s of an angle')
     """
-    return "m/s" if scene.walls is not None else "m/s, or rad/s of an angle"
+    if scene.walls is not None:
+        return "m/s"
+    return "m/s, or rad/s of an angle"
 
 
 @full_precision
 def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
-    """Gap velocities `gamma = N^T v` (m,) [m/s] of velocities (n,); negative on approach.
+    """Gap velocities `gamma = N^T v` (m,) [m/s]; negative on approach.
 
     Args:
         scene: n coordinates, m contacts.
@@ -470,7 +558,9 @@ def momentum(scene: Scene, velocity: Any) -> jax.Array:
     [1.0, 1.0]
     """
     v = as_velocity(scene, velocity)
-    return scene.mass * v if scene.mass.ndim == 1 else scene.mass @ v
+    if scene.mass.ndim == 1:
+        return scene.mass * v
+    return scene.mass @ v
 
 
 @full_precision
@@ -498,14 +588,18 @@ def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
 def dense_mass(scene: Scene) -> np.ndarray:
     """M (n, n) on the host, in double precision."""
     mass = np.asarray(scene.mass, float)
-    return np.diag(mass) if mass.ndim == 1 else mass
+    if mass.ndim == 1:
+        return np.diag(mass)
+    return mass
 
 
 @full_precision
 def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
-    """`M^-1 b` of `right` b (n,) or (n, k), with the reactions of bilateral constraints.
+    """`M^-1 b` of `right` b (n,) or (n, k), with the reactions of bilateral
+    constraints.
 
-    Equation: `y = x - M^-1 h (h^T M^-1 h)^-1 h^T x`, `x = M^-1 b`, with constraints h: `h^T y = 0`.
+    Equation: `y = x - M^-1 h (h^T M^-1 h)^-1 h^T x`, `x = M^-1 b`, with constraints h:
+    `h^T y = 0`.
     """
     free = solve_mass_matrix(scene.mass, right)
     if scene.constraints is None:
@@ -538,7 +632,9 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
     check_shape("impulse", impulse, (scene.contacts,), "one per contact")
     if tangential is not None and scene.tangents is not None:
         tangential = as_float_array("tangential", tangential)
-        check_shape("tangential", tangential, scene.tangents.shape[1:], "one per tangent")
+        check_shape(
+            "tangential", tangential, scene.tangents.shape[1:], "one per tangent"
+        )
     if scene.pairs is not None:
         return solve_mass(scene, scene.pairs.push(impulse))
     if scene.walls is None:
@@ -553,21 +649,32 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
 
 def without_constraints(scene: Scene) -> Scene:
     """The scene without its bilateral constraints."""
-    return scene if scene.constraints is None else eqx.tree_at(_CONSTRAINTS, scene, None)
+    if scene.constraints is None:
+        return scene
+    return eqx.tree_at(_CONSTRAINTS, scene, None)
 
 
-def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | None) -> Scene:
-    """A chain: its normals stay implicit, its Delassus matrix tridiagonal (see `ji.chain`)."""
+def chain_scene(
+    masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | None
+) -> Scene:
+    """A chain: its normals stay implicit, its Delassus matrix tridiagonal (see
+    `ji.chain`).
+    """
     return _unchecked(mass=masses, walls=walls, gaps=gaps)
 
 
-def sparse_scene(mass: jax.Array, directions: jax.Array, bodies: np.ndarray, count: int) -> Scene:
+def sparse_scene(
+    mass: jax.Array, directions: jax.Array, bodies: np.ndarray, count: int
+) -> Scene:
     """A packing: m frictionless contacts between two of `count` bodies each.
 
-    `mass` (n,), `directions` (m, 2, n / count) of `bodies` (m, 2), where -1 is none (a wall): its
-    direction is 0. Only these entries of the normals are stored, and its Delassus matrix is sparse.
+    `mass` (n,), `directions` (m, 2, n / count) of `bodies` (m, 2), where -1 is none (a
+    wall): its direction is 0. Only these entries of the normals are stored, and its
+    Delassus matrix is sparse.
     """
-    return _unchecked(mass=mass, _normals=PairNormals(directions, Neighbours(bodies, count)))
+    return _unchecked(
+        mass=mass, _normals=PairNormals(directions, Neighbours(bodies, count))
+    )
 
 
 def _unchecked(**fields: Any) -> Scene:
@@ -580,15 +687,18 @@ def _unchecked(**fields: Any) -> Scene:
 
 def _check_scene(scene: Scene) -> None:
     """Raise a ValueError unless shapes and values are those that `Scene` documents."""
-    mass, normals = scene.mass, scene.normals
+    mass = scene.mass
+    normals = scene.normals
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(
-            f"Argument `mass` must have shape (n,) or (n, n), but has shape {mass.shape}."
+            f"Argument `mass` must have shape (n,) or (n, n), but has shape "
+            f"{mass.shape}."
         )
     n = mass.shape[0]
     if normals.ndim != 2 or normals.shape[0] != n or normals.shape[1] == 0:
         raise ValueError(
-            f"Argument `normals` must have shape (n, m) with n = {n} as in `mass` and m >= 1, "
+            f"Argument `normals` must have shape (n, m) with n = {n} as in `mass` and "
+            f"m >= 1, "
             f"but has shape {normals.shape}."
         )
     m = normals.shape[1]
@@ -596,7 +706,8 @@ def _check_scene(scene: Scene) -> None:
     if not is_traced(normals) and not _has_body(np.asarray(normals)).all():
         contact = int(np.argmin(_has_body(np.asarray(normals)))) + 1
         raise ValueError(
-            "Argument `normals` must have no zero column: such a contact has no body, but that of "
+            "Argument `normals` must have no zero column: such a contact has no body, "
+            "but that of "
             f"contact {contact} is zero."
         )
     check_mass(mass)
@@ -622,16 +733,21 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _check_directions(scene: Scene) -> None:
-    """Warn where the normal and tangents D_i (n, d) of a contact are dependent, or oblique.
+    """Warn where the normal and tangents D_i (n, d) of a contact are dependent, or
+    oblique.
 
-    Equation: dependent where the least eigenvalue of `D_i^T M^-1 D_i`, scaled to a diagonal of 1,
-    is below `_DEPENDENT`; oblique as of `_is_oblique`.
+    Equation: dependent where the least eigenvalue of `D_i^T M^-1 D_i`, scaled to a
+    diagonal of 1, is below `_DEPENDENT`; oblique as of `_is_oblique`.
     """
     if is_traced((scene.mass, scene.normals, scene.tangents)):
         return
-    n, m, mass = scene.size, scene.contacts, np.asarray(scene.mass, float)
+    n = scene.size
+    m = scene.contacts
+    mass = np.asarray(scene.mass, float)
     tangents = np.asarray(scene.tangents, float).reshape(n, m, -1)
-    directions = np.concatenate([np.asarray(scene.normals, float)[:, :, None], tangents], axis=2)
+    directions = np.concatenate(
+        [np.asarray(scene.normals, float)[:, :, None], tangents], axis=2
+    )
     columns = directions.reshape(n, -1)
     if mass.ndim == 1:
         kinetic = columns.T / np.sqrt(mass)
@@ -645,29 +761,37 @@ def _check_directions(scene: Scene) -> None:
     oblique = _is_oblique(dense_mass(scene), np.moveaxis(directions, 1, 0))
     if dependent.any():
         warnings.warn(
-            f"The normal and tangents of contact {int(np.argmax(dependent)) + 1} depend on each "
-            "other: this is right only if its bodies cannot move in all of these directions.",
+            f"The normal and tangents of contact {int(np.argmax(dependent)) + 1} "
+            f"depend on each "
+            "other: this is right only if its bodies cannot move in all of these "
+            "directions.",
             stacklevel=2,
         )
     elif oblique.any():
         warnings.warn(
-            f"The tangents of contact {int(np.argmax(oblique)) + 1} are not at right angles to its "
-            "normal and to each other, and of its length, where the mass matrix looks like that "
-            "of a body's position: slip velocities and Coulomb's cone are then distorted.",
+            f"The tangents of contact {int(np.argmax(oblique)) + 1} are not at right "
+            f"angles to its "
+            "normal and to each other, and of its length, where the mass matrix looks "
+            "like that "
+            "of a body's position: slip velocities and Coulomb's cone are then "
+            "distorted.",
             stacklevel=2,
         )
 
 
 def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """True (m,) for contacts whose directions (m, n, d) are not orthonormal in bodies' positions.
+    """True (m,) for contacts whose directions (m, n, d) are not orthonormal in bodies'
+    positions.
 
-    A scene does not say which coordinates are positions. The candidates are the uncoupled
-    coordinates of one and the same mass. Let D be the rows of the d directions for them, b the
-    square of the normal in D, and k how many rows are not 0. Positions of b bodies (1 or 2) have a
-    unit normal each and d coordinates each: where `k = d b` they are taken for positions, and the
-    directions are oblique unless `D^T D = b I`. Rotations fit this by chance only.
+    A scene does not say which coordinates are positions. The candidates are the
+    uncoupled coordinates of one and the same mass. Let D be the rows of the d
+    directions for them, b the square of the normal in D, and k how many rows are not 0.
+    Positions of b bodies (1 or 2) have a unit normal each and d coordinates each: where
+    `k = d b` they are taken for positions, and the directions are oblique unless
+    `D^T D = b I`. Rotations fit this by chance only.
     """
-    masses, count = np.diag(mass), directions.shape[2]
+    masses = np.diag(mass)
+    count = directions.shape[2]
     moves: np.ndarray = np.any(directions, axis=2)
     uncoupled = np.count_nonzero(mass, axis=1) == 1
     oblique = np.zeros(len(directions), bool)
@@ -675,15 +799,21 @@ def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
         position = np.flatnonzero(uncoupled & (masses == value))
         part = directions[:, position]
         gram = np.swapaxes(part, 1, 2) @ part
-        bodies, moved = gram[:, 0, 0], moves[:, position].sum(axis=1)  # b, of unit normals
-        are_positions = np.isclose(moved, count * bodies, rtol=_ORTHONORMAL_WITHIN) & (bodies > 0)
+        # b, of unit normals
+        bodies = gram[:, 0, 0]
+        moved = moves[:, position].sum(axis=1)
+        are_positions = np.isclose(moved, count * bodies, rtol=_ORTHONORMAL_WITHIN) & (
+            bodies > 0
+        )
         error = np.abs(gram - bodies[:, None, None] * np.eye(count)).max(axis=(1, 2))
         oblique |= are_positions & (error > _ORTHONORMAL_WITHIN * bodies)
     return oblique
 
 
 def _has_body(normals: Any) -> Any:
-    """True (m,) for contacts whose normal, a column of `normals` (n, m), is not zero."""
+    """True (m,) for contacts whose normal, a column of `normals` (n, m), is not
+    zero.
+    """
     return (normals != 0).any(axis=0)
 
 
@@ -693,12 +823,15 @@ def _is_symmetric(mass: Any) -> Any:
 
 
 def is_allowed(scene: Scene) -> jax.Array:
-    """True () if the values of a traced scene are those that `Scene` allows on the host.
+    """True () if the values of a traced scene are those that `Scene` allows on the
+    host.
 
-    NaN is not looked for; a dense M that is not positive definite gives energies without a value,
-    a normal that is zero gives a contact without a scale.
+    NaN is not looked for; a dense M that is not positive definite gives energies
+    without a value, a normal that is zero gives a contact without a scale.
     """
-    allowed = [jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)]
+    allowed = [
+        jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)
+    ]
     if scene.gaps is not None:
         allowed.append(jnp.all(scene.gaps >= 0))
     return jnp.all(jnp.asarray(allowed))
@@ -708,16 +841,20 @@ def _check_independent(constraints: jax.Array) -> None:
     """Raise a ValueError where columns of the constraints depend on each other."""
     if is_traced(constraints):
         return
-    rank, b = np.linalg.matrix_rank(np.asarray(constraints)), constraints.shape[1]
+    rank = np.linalg.matrix_rank(np.asarray(constraints))
+    b = constraints.shape[1]
     if rank < b:
         raise ValueError(
-            f"Argument `constraints` must have independent columns, but {b} columns have "
+            f"Argument `constraints` must have independent columns, but {b} columns "
+            f"have "
             f"rank {rank}."
         )
 
 
 def check_mass(mass: jax.Array) -> None:
-    """Raise a ValueError unless M is (n,) > 0, or (n, n) symmetric positive definite."""
+    """Raise a ValueError unless M is (n,) > 0, or (n, n) symmetric positive
+    definite.
+    """
     if mass.ndim == 1:
         check_values("mass", mass, low=0.0, open_low=True)
         return

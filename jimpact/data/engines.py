@@ -1,4 +1,6 @@
-"""Impacts of several bodies by some thirty physics engines, and the law nearest to each."""
+"""Impacts of several bodies by some thirty physics engines, and the law nearest to
+each.
+"""
 
 import csv
 from dataclasses import dataclass
@@ -10,14 +12,17 @@ from jimpact.tools.records import Column, Table, Tabular
 
 
 class EngineScene(NamedTuple):
-    """Balls in a row that touch: `masses` (n,) [kg], `wall` as of `ji.chain`, the e asked for."""
+    """Balls in a row that touch: `masses` (n,) [kg], `wall` as of `ji.chain`, the e
+    asked for.
+    """
 
     masses: tuple[float, ...]
     wall: bool
     restitution: float
 
 
-# Ball 1 comes at 1 m/s, the others rest. Velocities that an engine was given are divided by v1-.
+# Ball 1 comes at 1 m/s, the others rest. Velocities that an engine was given are
+# divided by v1-.
 ENGINE_SCENES = {
     "S1": EngineScene((1.0, 1.0, 1.0), False, 1.0),
     "S2": EngineScene((1.0, 1.0, 1.0, 1.0, 1.0), False, 1.0),
@@ -30,10 +35,10 @@ ENGINE_SCENES = {
 class EngineImpact(NamedTuple):
     """Outcome of one scene by one engine.
 
-    `velocity` (n,): v+ over v1-. `momentum` and `energy_ratio`: after over before (None with a
-    wall). `nearest_law` with `nearest_e`, among Moreau, Binary and LZB with Hertz contacts or
-    linear springs and any e, and the `distance` of its v+, over |v-|, in the energy norm; then the
-    second.
+    `velocity` (n,): v+ over v1-. `momentum` and `energy_ratio`: after over before (None
+    with a wall). `nearest_law` with `nearest_e`, among Moreau, Binary and LZB with
+    Hertz contacts or linear springs and any e, and the `distance` of its v+, over |v-|,
+    in the energy norm; then the second.
     """
 
     engine: str
@@ -58,27 +63,36 @@ class EngineImpacts(Tabular):
 
     @property
     def table(self) -> Table:
-        """Table: a row for each measurement; velocities v+ of up to five balls over v1-."""
+        """Table: a row for each measurement; velocities v+ of up to five balls over
+        v1-.
+        """
         columns = [Column(name) for name in ("engine", "version", "scene", "setting")]
         columns += [Column(f"v{i}", "+.3f") for i in range(1, 6)]
         columns += [Column("momentum", ".3f"), Column("energy_ratio", ".3f", "energy")]
-        columns += [Column("nearest_law", head="nearest law"), Column("nearest_e", ".2f", "e")]
+        columns += [
+            Column("nearest_law", head="nearest law"),
+            Column("nearest_e", ".2f", "e"),
+        ]
         columns += [Column("distance", ".3f"), Column("second_law", head="second")]
         columns += [Column("second_distance", ".3f", "its distance")]
         cells = []
         for row in self.rows:
             v = [*row.velocity, *[None] * (5 - len(row.velocity))]
             cells.append([*row[:4], *v, *row[5:]])
-        notes = ["Measured on 28 November 2026; v in units of v1-. See docs/engines.md."]
+        notes = [
+            "Measured on 28 November 2026; v in units of v1-. See docs/engines.md."
+        ]
         return Table(columns, cells, notes=notes, keys=4)
 
 
-def engine_impacts(engine: str | None = None, scene: str | None = None) -> EngineImpacts:
-    """Outcomes of impacts of touching balls by some thirty physics engines, and the nearest laws.
+def engine_impacts(
+    engine: str | None = None, scene: str | None = None
+) -> EngineImpacts:
+    """Impacts of touching balls by some thirty physics engines, and the nearest laws.
 
-    Each engine was asked for e in its own documented way. Scenes `ji.data.ENGINE_SCENES`: S1 three
-    balls, e = 1; S2 five; S3 three, e = .5; S4 two and a wall; S8 a light ball between two heavy
-    ones.
+    Each engine was asked for e in its own documented way. Scenes
+    `ji.data.ENGINE_SCENES`: S1 three balls, e = 1; S2 five; S3 three, e = .5; S4 two
+    and a wall; S8 a light ball between two heavy ones.
 
     Args:
         engine: only of this one; None: all.
@@ -90,21 +104,27 @@ def engine_impacts(engine: str | None = None, scene: str | None = None) -> Engin
     Raises:
         ValueError: no such engine or scene.
 
-    Source: own measurements, 28 November 2026, of the versions in the table; nearest laws by
-    `tests/validation/engines/nearest.py`.
+    Source: own measurements, 28 November 2026, of the versions in the table; nearest
+    laws by `tests/validation/engines/nearest.py`.
 
     >>> import jimpact as ji
     >>> row = ji.data.engine_impacts("rapier2d", "S1").rows[0]
     >>> row.velocity, row.energy_ratio
     ((-0.174, 0.349, 0.826), 0.834)
     """
-    with (files("jimpact") / "data" / "engine_impacts.csv").open(encoding="utf-8") as file:
+    with (files("jimpact") / "data" / "engine_impacts.csv").open(
+        encoding="utf-8"
+    ) as file:
         every = [_row(line) for line in csv.DictReader(file)]
     for name, value in (("engine", engine), ("scene", scene)):
         known = list(dict.fromkeys(getattr(row, name) for row in every))
         if value is not None:
             check_choice(name, value, known)
-    chosen = (row for row in every if engine in (None, row.engine) and scene in (None, row.scene))
+    chosen = (
+        row
+        for row in every
+        if engine in (None, row.engine) and scene in (None, row.scene)
+    )
     return EngineImpacts(tuple(chosen))
 
 

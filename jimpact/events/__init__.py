@@ -12,8 +12,9 @@ Shapes stand in the signatures, `Float[Array, "m B"]`, with these names of axes:
     K      neighbours of a contact
     s      samples of a history, in the first axis
 
-`1` is one row for all contacts; `...` and `*B` are any number of axes, also none; `#` allows an
-axis of length 1 in the place of a longer one. `tests/rules/test_shapes.py` checks them.
+`1` is one row for all contacts; `...` and `*B` are any number of axes, also none; `#`
+allows an axis of length 1 in the place of a longer one. `tests/rules/test_shapes.py`
+checks them.
 """
 
 import lazy_loader

@@ -1,25 +1,31 @@
-"""Forces in contacts as a flow: LZB, gaps and viscous forces, with and without planar friction.
+"""Forces in contacts as a flow: LZB, gaps and viscous forces, with and without planar
+friction.
 
 With sqrt-energy units (see `impact_dynamics.py`) and frozen geometry the law reads
 
     x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j,
     gamma' = G F + K_nt lambda,    u' = K_tn F + K_tt lambda
 
-with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2. In
-expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units of the smallest e
-of these contacts: nothing is then divided by e, so that e = 0 is an ordinary, differentiable case
-(the whole expansion takes no time; derivatives in e there are one-sided).
+with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1)
+/ 2. In expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units
+of the smallest e of these contacts: nothing is then divided by e, so that e = 0 is an
+ordinary, differentiable case (the whole expansion takes no time; derivatives in e there
+are one-sided).
 
-STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each). A flow that
+STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each). A
+flow that
                `watches` its exponents has one more before the time.
-MODES (rows)   phase (m), how often each contact has closed (m); with friction the slip: 0 sticks,
+MODES (rows)   phase (m), how often each contact has closed (m); with friction the slip:
+0 sticks,
                +-1 the direction (m).
 
-A contact is OPEN, in COMPRESSION or in EXPANSION. Without gaps the geometry is frozen: an open
-contact closes as soon as gamma < 0. With gaps (`gapped`) it keeps track of x = -gap and closes when
-that returns to 0. A `viscous` force replaces the power law; it never pulls, so that a contact
-may be SLACK: x > 0, and no force. It opens at x = 0, from SLACK or, with what force it has there,
-from COMPRESSION. With a `limit` of x the force is bounded: the contact YIELDS at
+A contact is OPEN, in COMPRESSION or in EXPANSION. Without gaps the geometry is frozen:
+an open contact closes as soon as gamma < 0. With gaps (`gapped`) it keeps track of x =
+-gap and closes when that returns to 0. A `viscous` force replaces the power law; it
+never pulls, so that a contact
+may be SLACK: x > 0, and no force. It opens at x = 0, from SLACK or, with what force it
+has there, from COMPRESSION. With a `limit` of x the force is bounded: the contact
+YIELDS at
 x = limit until it expands, and what it takes up meanwhile is lost.
 """
 
@@ -49,31 +55,35 @@ class Phase(enum.IntEnum):
     YIELD = 4
 
 
-# The first two are in tolerances of velocity. Margins closer to 0 than SNAP are 0; ten times more
-# would move events by a tenth of the tolerance. An approach or a load below NEGLIGIBLE does nothing
-# more; ten times more would lose what the tolerance promises.
+# The first two are in tolerances of velocity. Margins closer to 0 than SNAP are 0; ten
+# times more would move events by a tenth of the tolerance. An approach or a load below
+# NEGLIGIBLE does nothing more; ten times more would lose what the tolerance promises.
 SNAP = 1e-2
 NEGLIGIBLE = 0.1
-# Passes per contact after which an impact may end at WIDENED times the tolerance: some re-close so
-# often that they would not end. Ten times more passes: such impacts take ten times longer; ten
-# times wider: they end with errors of 1000 tolerances.
+# Passes per contact after which an impact may end at WIDENED times the tolerance: some
+# re-close so often that they would not end. Ten times more passes: such impacts take
+# ten times longer; ten times wider: they end with errors of 1000 tolerances.
 PATIENCE = 2000
 WIDENED = 100.0  # tolerances, at which an impact may end after PATIENCE passes
-# Passes per contact, which few impacts need, before endless closings are checked for; ten times
-# more: they are detected later.
+# Passes per contact, which few impacts need, before endless closings are checked for;
+# ten times more: they are detected later.
 DRAGGING = 100
-# Closings of a contact, from which on they may be endless, a power of 2: ten times more:
+# Closings of a contact, from which on they may be endless, a power of 2: ten times
+# more:
 # detected later.
 OFTEN = 8
-# Contacts of a chain, more of which may come to rest together in no order that returns; passes per
-# contact after which a look ahead decides (`look_ahead.py`), again after twice, four times as many.
-# Ten times more contacts: chains of 20 take 30 times as long; ten times more passes: as much later.
-MANY, LOOKS = 8, 15
-# Tolerances within which a flow watches the derivative of its forces in the exponents; the
-# tolerance is then that of derivatives, a hundred times finer than the law's. Ten times more: such
-# derivatives are ten times coarser than the others.
+# Contacts of a chain, more of which may come to rest together in no order that returns;
+# passes per contact after which a look ahead decides (`look_ahead.py`), again after
+# twice, four times as many. Ten times more contacts: chains of 20 take 30 times as
+# long; ten times more passes: as much later.
+MANY = 8
+LOOKS = 15
+# Tolerances within which a flow watches the derivative of its forces in the exponents;
+# the tolerance is then that of derivatives, a hundred times finer than the law's. Ten
+# times more: such derivatives are ten times coarser than the others.
 WATCHED = 100.0
-# Whole and half exponents below it are products, not powers. Ten times more: longer products.
+# Whole and half exponents below it are products, not powers. Ten times more: longer
+# products.
 LARGE = 6.0
 
 T = TypeVar("T")
@@ -91,25 +101,36 @@ def power(x: Float[Array, "m *B"], exponent: Exponent) -> Float[Array, "m *B"]:
     if isinstance(exponent, float) and exponent < LARGE and (2 * exponent).is_integer():
         x = jnp.where(positive, x, 0.0)
         whole = [x] * int(exponent)
-        factors = whole if exponent.is_integer() else [*whole, jnp.sqrt(safe)]
+        if exponent.is_integer():
+            factors = whole
+        else:
+            factors = [*whole, jnp.sqrt(safe)]
         return functools.reduce(jnp.multiply, factors)
     eta = per_row(exponent, x)
     return jnp.where(positive, jnp.exp(eta * jnp.log(safe)), 0.0)
 
 
 def per_row(values: Exponent, like: Float[Array, "m *B"]) -> Float[Array, "#m *#B"]:
-    """Values of contacts, (m,) or one, with axes of length 1 to broadcast against `like`."""
+    """Values of contacts, (m,) or one, with axes of length 1 to broadcast against
+    `like`.
+    """
     values = jnp.asarray(values, like.dtype)
-    return values if values.ndim == like.ndim else values.reshape(-1, *[1] * (like.ndim - 1))
+    if values.ndim == like.ndim:
+        return values
+    return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def plus_one(exponent: Exponent) -> Exponent:
     """`exponent + 1`, static where `exponent` is."""
-    return tuple(e + 1 for e in exponent) if isinstance(exponent, tuple) else exponent + 1
+    if isinstance(exponent, tuple):
+        return tuple(e + 1 for e in exponent)
+    return exponent + 1
 
 
 class Viscous(NamedTuple):
-    """A force `model` (see `laws/forces.py`), and the units that make it dimensionless."""
+    """A force `model` (see `laws/forces.py`), and the units that make it
+    dimensionless.
+    """
 
     model: Any
     indentation: Float[Array, "m *B"]  # X [m]
@@ -117,20 +138,28 @@ class Viscous(NamedTuple):
     force: Float[Array, "m *B"]  # F_0 [N]
     onset_unit: Float[Array, "m *B"]  # of `onset`, whose dimension is the model's own
 
-    def push(self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]) -> Float[Array, "m B"]:
+    def push(
+        self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]
+    ) -> Float[Array, "m B"]:
         """Dimensionless force `max(F(X x, -V gamma), 0) / F_0`: it never pulls."""
         x = jnp.where(x >= 0, x, 0.0) * self.indentation
         return jnp.maximum(self._value("force", x, gamma) / self.force, 0.0)
 
-    def onset(self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]) -> Float[Array, "m B"]:
-        """Smooth function of order 1 with the sign of the force, which says where it sets in."""
+    def onset(
+        self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]
+    ) -> Float[Array, "m B"]:
+        """Smooth function of order 1 with the sign of the force, which says where it
+        sets in.
+        """
         x = jnp.where(x >= 0, x, 0.0) * self.indentation
         return self._value("onset", x, gamma) / self.onset_unit
 
     def _value(
         self, name: str, x: Float[Array, "m B"], gamma: Float[Array, "m B"]
     ) -> Float[Array, "m B"]:
-        """Method `name` of the model at x [m] and -V gamma [m/s]; it knows one impact, no batch."""
+        """Method `name` of the model at x [m] and -V gamma [m/s]; it knows one impact,
+        no batch.
+        """
 
         def of_one(
             model: Any, x: Float[Array, " m"], rate: Float[Array, " m"]
@@ -138,7 +167,9 @@ class Viscous(NamedTuple):
             """The method's values in the contacts of one impact."""
             return getattr(model, name)(x, rate)
 
-        return jax.vmap(of_one, in_axes=-1, out_axes=-1)(self.model, x, -gamma * self.speed)
+        return jax.vmap(of_one, in_axes=-1, out_axes=-1)(
+            self.model, x, -gamma * self.speed
+        )
 
 
 # fields of flows and couplings that are no arrays: they belong to the program
@@ -146,10 +177,11 @@ COMPILED_IN = ("exponent_static", "gapped", "closed_form", "watches", "neighbour
 
 
 def as_pytree(kind: type[T]) -> type[T]:
-    """A dataclass of arrays as a pytree; the fields COMPILED_IN belong to its structure.
+    """A dataclass of arrays as a pytree; the fields COMPILED_IN belong to its
+    structure.
 
-    JAX rebuilds it without its constructor, whose annotations hold for arrays only: in between the
-    leaves are `Dual`s, axes or placeholders.
+    JAX rebuilds it without its constructor, whose annotations hold for arrays only: in
+    between the leaves are `Dual`s, axes or placeholders.
     """
     names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
     arrays = [name for name in names if name not in COMPILED_IN]
@@ -157,7 +189,9 @@ def as_pytree(kind: type[T]) -> type[T]:
 
     def flatten(tree: T) -> tuple[list[Any], tuple[Any, ...]]:
         """Values of the fields that are arrays, and of the others."""
-        return [getattr(tree, name) for name in arrays], tuple(getattr(tree, n) for n in fixed)
+        return [getattr(tree, name) for name in arrays], tuple(
+            getattr(tree, n) for n in fixed
+        )
 
     def unflatten(structure: tuple[Any, ...], leaves: Any) -> T:
         """The inverse of `flatten`."""
@@ -171,7 +205,9 @@ def as_pytree(kind: type[T]) -> type[T]:
 
 
 def written_out(coupling: Any, n: int) -> Float[Array, "n n B"]:
-    """The matrix of n rows of a coupling that multiplies: its products with unit vectors."""
+    """The matrix of n rows of a coupling that multiplies: its products with unit
+    vectors.
+    """
     entries = jax.tree.leaves(coupling)[0]
     one = jnp.eye(n, dtype=entries.dtype)[..., None]
     columns = jnp.broadcast_to(one, (n, n, entries.shape[-1]))
@@ -229,7 +265,9 @@ class Dense(NamedTuple):
 @as_pytree
 @dataclasses.dataclass(frozen=True)
 class Packing:
-    """The coupling of a packing: entries of G off its unit diagonal, at neighbours of each row."""
+    """The coupling of a packing: entries of G off its unit diagonal, at neighbours of
+    each row.
+    """
 
     entries: Float[Array, "m K B"]
     neighbours: Neighbours
@@ -274,14 +312,17 @@ class ContactStates(NamedTuple):
     tangential_force: Float[Array, "t B"]  # lambda
     tangential_impulse: Float[Array, "t B"]  # its integral
     slip: Float[Array, "t B"]  # u
-    tangential_energy: Float[Array, "_ B"]  # twice that of tangential springs (m), or none
+    # twice that of tangential springs (m), or none
+    tangential_energy: Float[Array, "_ B"]
     rate: Float[Array, "1 B"]  # of time, in the flow's own time
 
 
 @as_pytree
 @dataclasses.dataclass
 class ContactFlow(Flow):
-    """The motion of m contacts without friction; see above for its state and its modes."""
+    """The motion of m contacts without friction; see above for its state and its
+    modes.
+    """
 
     coupling: Coupling
     omega: Float[Array, "m B"]  # (m, B)
@@ -293,9 +334,11 @@ class ContactFlow(Flow):
     limit: Float[Array, "m B"] | None = None  # indentation at which the force stays
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
-    closed_form: bool = True  # an impact may end by the energy of contacts that work alone
-    # Steps are also short enough for the derivative in the exponents, F log x: it is less smooth at
-    # x = 0 than F. At exponent 1 F is linear, and steps of any length would do for it alone.
+    # an impact may end by the energy of contacts that work alone
+    closed_form: bool = True
+    # Steps are also short enough for the derivative in the exponents, F log x: it is
+    # less smooth at x = 0 than F. At exponent 1 F is linear, and steps of any length
+    # would do for it alone.
     watches: bool = False
 
     longest = math.inf  # no rate is much larger than the others
@@ -331,19 +374,25 @@ class ContactFlow(Flow):
     @property
     def adding(self) -> tuple[int, ...]:
         """Sizes of the blocks of rows that only add up: p, the watching row, time."""
-        return (self.contacts, 1, 1) if self.watches else (self.contacts, 1)
+        if self.watches:
+            return (self.contacts, 1, 1)
+        return (self.contacts, 1)
 
     def rows(
         self, y: Float[Array, "driving B"]
     ) -> tuple[Float[Array, "m B"], Float[Array, "m B"], Float[Array, "_ B"]]:
-        """Rows of a state: indentations x, g = gamma / s, impulses p (none within a step)."""
+        """Rows of a state: indentations x, g = gamma / s, impulses p (none within a
+        step).
+        """
         m = self.contacts
         return y[:m], y[m : 2 * m], y[2 * m : 3 * m]
 
     def start(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state before the impact; a touching contact at rest starts in compression."""
+        """Modes and state before the impact; a touching contact at rest starts in
+        compression.
+        """
         phase = jnp.where((gamma <= 0) | (x > 0), Phase.COMPRESSION, Phase.OPEN)
         phase = jnp.where(x < 0, Phase.OPEN, phase)
         expands = (x > 0) & (gamma > 0)
@@ -351,40 +400,53 @@ class ContactFlow(Flow):
             phase = jnp.where(expands, Phase.EXPANSION, phase)
         # loaded, separating and e = 0: it opens at once and returns nothing
         spent = (phase == Phase.EXPANSION) & (self.restitution == 0)
-        phase, x = jnp.where(spent, Phase.OPEN, phase), jnp.where(spent, 0.0, x)
+        phase = jnp.where(spent, Phase.OPEN, phase)
+        x = jnp.where(spent, 0.0, x)
         g = gamma / jnp.where(phase == Phase.EXPANSION, self.restitution, 1.0)
         modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
         last = jnp.zeros_like(g[:1])
-        watched = [last] if self.watches else []
+        if self.watches:
+            watched = [last]
+        else:
+            watched = []
         return modes, jnp.concatenate([x, g, jnp.zeros_like(g), *watched, last])
 
     def scales(self, modes: Int[Array, "modes B"]) -> Float[Array, "m B"]:
         """`s_j = gamma_j / g_j`: e_j in expansion, otherwise 1."""
-        return jnp.where(modes[: self.contacts] == Phase.EXPANSION, self.restitution, 1.0)
+        return jnp.where(
+            modes[: self.contacts] == Phase.EXPANSION, self.restitution, 1.0
+        )
 
     # ---- the protocol
 
     def constants(self, modes: Int[Array, "modes B"]) -> Any:
-        """Constants of the field in these modes; without friction its normal factors alone."""
+        """Constants of the field in these modes; without friction its normal factors
+        alone.
+        """
         return self.normal_constants(modes)
 
     def normal_constants(self, modes: Int[Array, "modes B"]) -> Frozen:
         """Factors of the normal field in the phases of the contacts."""
-        phase, s = modes[: self.contacts], self.scales(modes)
-        # the least s makes e = 0 regular; of several equal ones, one: min() would share its
-        # derivative among them
-        least = (
-            functools.reduce(
-                lambda a, b: jnp.where(b < a, b, a), [s[j : j + 1] for j in range(self.contacts)]
+        phase = modes[: self.contacts]
+        s = self.scales(modes)
+        # the least s makes e = 0 regular; of several equal ones, one: min() would share
+        # its derivative among them
+        if self.contacts <= COLUMNS_WRITTEN_OUT:
+            least = functools.reduce(
+                lambda a, b: jnp.where(b < a, b, a),
+                [s[j : j + 1] for j in range(self.contacts)],
             )
-            if self.contacts <= COLUMNS_WRITTEN_OUT
-            else jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
-        )
+        else:
+            least = jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
         ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)
-        moves = jnp.ones_like(phase, bool) if self.gapped else phase != Phase.OPEN
+        if self.gapped:
+            moves = jnp.ones_like(phase, bool)
+        else:
+            moves = phase != Phase.OPEN
         loaded = (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
         if self.limit is not None:
-            moves, loaded = moves & (phase != Phase.YIELD), loaded | (phase == Phase.YIELD)
+            moves = moves & (phase != Phase.YIELD)
+            loaded = loaded | (phase == Phase.YIELD)
         closing = jnp.where(moves, -ratio * self.omega, 0.0)
         stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
         return Frozen(least, ratio, closing, jnp.where(loaded, stiffness, 0.0), s)
@@ -392,7 +454,9 @@ class ContactFlow(Flow):
     def force(
         self, const: Frozen, x: Float[Array, "m B"], g: Float[Array, "m B"]
     ) -> Float[Array, "m B"]:
-        """Normal forces `F = stiffness x^eta`; p' = unit F by the time in units of `s*`."""
+        """Normal forces `F = stiffness x^eta`; p' = unit F by the time in units of
+        `s*`.
+        """
         if self.viscous is None:
             return const.stiffness * power(x, self.exponent)
         return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
@@ -411,12 +475,16 @@ class ContactFlow(Flow):
         if self.watches:
             slope = f * jnp.log(jnp.where(x > 0, x, 1.0))
             watched = [jax.lax.stop_gradient(const.unit * total(slope))]
-        return jnp.concatenate([const.closing * g, dg, const.unit * f, *watched, const.unit])
+        return jnp.concatenate(
+            [const.closing * g, dg, const.unit * f, *watched, const.unit]
+        )
 
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "n #B"] | float:
-        """Allowed error of each row, in tolerances: more in the row that only watches."""
+        """Allowed error of each row, in tolerances: more in the row that only
+        watches.
+        """
         if not self.watches:
             return 1.0
         return jnp.ones_like(y[:, :1]).at[-2].set(WATCHED)
@@ -424,21 +492,25 @@ class ContactFlow(Flow):
     def margins(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "k B"]:
-        """Margins that are >= 0 until a contact changes its mode; without friction its phase."""
+        """Margins that are >= 0 until a contact changes its mode; without friction its
+        phase.
+        """
         return self.normal_margins(const, modes, y)
 
     def normal_margins(
         self, const: Frozen, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "k B"]:
-        """Margins that are >= 0 while a contact keeps its phase: m by indentation, m by velocity.
+        """Margins that are >= 0 while a contact keeps its phase: m by indentation, m by
+        velocity.
 
             phase         by indentation               by velocity
-            OPEN          1; with gaps -x              g + NEGLIGIBLE tolerance; with gaps 1
-            COMPRESSION   1; with a limit limit - x    -g
+            OPEN          1; with gaps -x              g + NEGLIGIBLE tolerance; with
+            gaps 1 COMPRESSION   1; with a limit limit - x    -g
             EXPANSION     x                            g
             YIELD         1                            -g
 
-        Where forces slacken: the onset in COMPRESSION, minus the onset in SLACK; x in both.
+        Where forces slacken: the onset in COMPRESSION, minus the onset in SLACK; x in
+        both.
         """
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
@@ -449,42 +521,60 @@ class ContactFlow(Flow):
             by_g = jnp.where(phase == Phase.YIELD, -g, by_g)
         if not self.gapped:
             return jnp.concatenate(
-                [by_x, by_g + jnp.where(phase == Phase.OPEN, NEGLIGIBLE * self.tolerance, 0.0)]
+                [
+                    by_x,
+                    by_g
+                    + jnp.where(phase == Phase.OPEN, NEGLIGIBLE * self.tolerance, 0.0),
+                ]
             )
         by_x = jnp.where(phase == Phase.OPEN, -x, by_x)
         by_g = jnp.where(phase == Phase.OPEN, 1.0, by_g)
         if self.slackens:
             onset = self.viscous.onset(x, g)  # type: ignore[union-attr]
-            compressed, slack = phase == Phase.COMPRESSION, phase == Phase.SLACK
+            compressed = phase == Phase.COMPRESSION
+            slack = phase == Phase.SLACK
             by_x = jnp.where(compressed, onset, jnp.where(slack, -onset, by_x))
             by_g = jnp.where(compressed | slack, x, by_g)
         return jnp.concatenate([by_x, by_g])
 
     def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "k B"]:
-        """Mask of the margins that are openings: x falls to 0 like the square of the time left."""
+        """Mask of the margins that are openings: x falls to 0 like the square of the
+        time left.
+        """
         phase = modes[: self.contacts]
         opens = phase == Phase.EXPANSION
         by_g = (phase == Phase.COMPRESSION) & self.slackens
         return jnp.concatenate([opens, by_g])
 
     def switch(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state after the events `which`; without friction those of the normal motion."""
+        """Modes and state after the events `which`; without friction those of the
+        normal motion.
+        """
         return self.normal_switch(modes, y, which)
 
     def normal_switch(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Phases, closings, x and g after events: m by indentation, then m by velocity.
 
-        An event ends the phase whose margin it is: OPEN closes to COMPRESSION, which turns to
-        EXPANSION (or YIELD), which opens or is compressed again. See `normal_margins`.
+        An event ends the phase whose margin it is: OPEN closes to COMPRESSION, which
+        turns to EXPANSION (or YIELD), which opens or is compressed again. See
+        `normal_margins`.
         """
         m = self.contacts
-        phase, count = modes[:m], modes[m : 2 * m]
+        phase = modes[:m]
+        count = modes[m : 2 * m]
         x, g, _ = self.rows(y)
-        by_x, by_g = which[:m], which[m : 2 * m]
+        by_x = which[:m]
+        by_g = which[m : 2 * m]
         if self.slackens:
             after = self._slackening(phase, by_x, by_g)
             opened = by_g & (phase != Phase.OPEN)
@@ -494,15 +584,24 @@ class ContactFlow(Flow):
             opened = by_x & (phase == Phase.EXPANSION)
             closed = (by_x | by_g) & (phase == Phase.OPEN)
             # what is left in it would do nothing more: it need not be unloaded
-            idle = power(x, plus_one(self.exponent)) <= (NEGLIGIBLE * self.tolerance) ** 2
+            idle = (
+                power(x, plus_one(self.exponent)) <= (NEGLIGIBLE * self.tolerance) ** 2
+            )
             turned = by_g & (phase == Phase.COMPRESSION)
-            after = jnp.where(turned, jnp.where(idle, Phase.OPEN, Phase.EXPANSION), phase)
+            after = jnp.where(
+                turned, jnp.where(idle, Phase.OPEN, Phase.EXPANSION), phase
+            )
             if self.limit is not None:
                 yields = by_x & (phase == Phase.COMPRESSION) & ~turned
-                after, x = jnp.where(yields, Phase.YIELD, after), jnp.where(yields, self.limit, x)
+                after = jnp.where(yields, Phase.YIELD, after)
+                x = jnp.where(yields, self.limit, x)
                 after = jnp.where(by_g & (phase == Phase.YIELD), Phase.EXPANSION, after)
-            after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)
-            after = jnp.where(opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after))
+            after = jnp.where(
+                by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after
+            )
+            after = jnp.where(
+                opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after)
+            )
             g = jnp.where(opened, self.restitution * g, g)
             g = jnp.where(by_g & (phase != Phase.OPEN), 0.0, g)
             x = jnp.where(opened | (turned & idle) | (closed & self.gapped), 0.0, x)
@@ -511,7 +610,10 @@ class ContactFlow(Flow):
         return modes, jnp.concatenate([x, g, y[2 * m :]])
 
     def _slackening(
-        self, phase: Int[Array, "m B"], by_x: Bool[Array, "m B"], by_g: Bool[Array, "m B"]
+        self,
+        phase: Int[Array, "m B"],
+        by_x: Bool[Array, "m B"],
+        by_g: Bool[Array, "m B"],
     ) -> Int[Array, "m B"]:
         """Phases after events where forces may vanish before the indentation."""
         after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
@@ -540,12 +642,17 @@ class ContactFlow(Flow):
 
     # ---- results
 
-    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
+    def contact_states(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> ContactStates:
         """Forces, velocities and the rate of time in a state."""
-        const, none = self.normal_constants(modes), y[:0]
+        const = self.normal_constants(modes)
+        none = y[:0]
         x, g, p = self.rows(y)
         force = self.force(const, x, g)
-        return ContactStates(force, x, p, const.scale * g, none, none, none, none, const.unit)
+        return ContactStates(
+            force, x, p, const.scale * g, none, none, none, none, const.unit
+        )
 
     def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
         """Change `G p` of the gap velocities by the impulses of a state."""
@@ -560,13 +667,21 @@ class ContactFlow(Flow):
 
     @property
     def self_similar(self) -> bool:
-        """True if a state multiplied by s takes the same course: see `plastic_limit.py`."""
+        """True if a state multiplied by s takes the same course: see
+        `plastic_limit.py`.
+        """
         return not self.gapped and self.viscous is None
 
     @property
     def looks_ahead(self) -> bool:
-        """True if the chain is so long that a look ahead decides whether it comes to rest."""
-        return isinstance(self.coupling, Chain) and self.contacts > MANY and self.self_similar
+        """True if the chain is so long that a look ahead decides whether it comes to
+        rest.
+        """
+        return (
+            isinstance(self.coupling, Chain)
+            and self.contacts > MANY
+            and self.self_similar
+        )
 
     def look_due(self, passes: Float[Array, "1 B"]) -> Bool[Array, "1 B"]:
         """Mask: passes per contact are LOOKS times 1, 2, 4, ..., and energy is lost."""
@@ -582,30 +697,45 @@ class ContactFlow(Flow):
         after: Int[Array, "modes B"],
         passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"] | None:
-        """Mask: the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
+        """Mask: the most closings of a contact become 8, 16, 32, ...: see
+        `plastic_limit.py`.
+        """
         if not self.self_similar:
             return None
         m = self.contacts
-        count, old = (jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before))
+        count, old = (
+            jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before)
+        )
         doubled = (count > old) & (count >= OFTEN) & (count & (count - 1) == 0)
         doubled = doubled & (passes > DRAGGING * m)
-        return doubled | self.look_due(passes) if self.looks_ahead else doubled
+        if self.looks_ahead:
+            return doubled | self.look_due(passes)
+        return doubled
 
     def patience(self, passes: Float[Array, "1 B"]) -> Float[Array, "1 B"]:
         """The tolerance, WIDENED once an impact drags on."""
-        return jnp.where(passes > PATIENCE * self.taking_part, WIDENED, 1.0) * self.tolerance
+        return (
+            jnp.where(passes > PATIENCE * self.taking_part, WIDENED, 1.0)
+            * self.tolerance
+        )
 
-    def energy(self, x: Float[Array, "m B"], g: Float[Array, "m B"]) -> Float[Array, "m B"]:
+    def energy(
+        self, x: Float[Array, "m B"], g: Float[Array, "m B"]
+    ) -> Float[Array, "m B"]:
         """Twice the energy of each contact by itself, `x^(eta + 1) + g^2`."""
         return power(x, plus_one(self.exponent)) + g * g
 
     def at_work(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], tolerance: Float[Array, "1 B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        tolerance: Float[Array, "1 B"],
     ) -> tuple[Bool[Array, "m B"], Float[Array, "m B"], Float[Array, "m B"]]:
-        """Mask of contacts at work, gamma, and the gamma that each would have at its end, alone.
+        """Mask of contacts at work, gamma, and the gamma that each would have at its
+        end, alone.
 
-        At work: loaded or approaching, with `x^(eta + 1) + g^2 > tolerance^2`; alone it ends with
-        e times the root of that.
+        At work: loaded or approaching, with `x^(eta + 1) + g^2 > tolerance^2`; alone it
+        ends with e times the root of that.
         """
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
@@ -620,11 +750,16 @@ class ContactFlow(Flow):
         return works, gamma, jnp.where(works, rebound, gamma)
 
     def over(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], passes: Float[Array, "1 B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"]:
-        """Mask: loaded contacts act on no others, so that the rest follows from their energies.
+        """Mask: loaded contacts act on no others, so that the rest follows from their
+        energies.
 
-        With changes d of gamma in contacts that end alone, others keep `gamma + min(G, 0) d >= 0`.
+        With changes d of gamma in contacts that end alone, others keep
+        `gamma + min(G, 0) d >= 0`.
         """
         tolerance = self.patience(passes)
         works, gamma, rebound = self.at_work(modes, y, tolerance)
@@ -632,15 +767,19 @@ class ContactFlow(Flow):
             return ~any_of(works)
         # |G| and min(G, 0), both with a unit diagonal: less the contact itself
         load = works.astype(y.dtype)
-        coupled = self.coupling.magnitude().times(load) - load > 0  # to another one at work
+        # to another one at work
+        coupled = self.coupling.magnitude().times(load) - load > 0
         change = rebound - gamma
-        least = gamma + self.coupling.pull().times(change) - change  # gamma+ of the others
+        # gamma+ of the others
+        least = gamma + self.coupling.pull().times(change) - change
         return ~any_of(jnp.where(works, coupled, least < -tolerance))
 
     def finish(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """All contacts open; where a closed form ends the impact, its impulses are added."""
+        """All contacts open; where a closed form ends the impact, its impulses are
+        added.
+        """
         m = self.contacts
         x, _, p = self.rows(y)
         _, gamma, rebound = self.at_work(modes, y, self.tolerance)

@@ -4,17 +4,17 @@
     slip:   lambda_j = -mu_j F_j u_j / |u_j|
     stick:  lambda such that u_j' = 0, while |lambda_j| <= mu_j F_j
 
-Which contacts slip and which stick is frozen in the modes (rows: phase, closings, slip: 0 sticks,
-else the sign of u). Margins of friction are the speed of slip and the distance to the friction
-cone. The normal forces follow from the indentations, so that lambda exists and u' is unique
-whatever mu is: there is no Painleve paradox. Where K_tt is singular (both corners of a block lying
-flat) lambda is shared among the contacts that stick in proportion to mu F: they then break loose
-together.
+Which contacts slip and which stick is frozen in the modes (rows: phase, closings, slip:
+0 sticks, else the sign of u). Margins of friction are the speed of slip and the
+distance to the friction cone. The normal forces follow from the indentations, so that
+lambda exists and u' is unique whatever mu is: there is no Painleve paradox. Where K_tt
+is singular (both corners of a block lying flat) lambda is shared among the contacts
+that stick in proportion to mu F: they then break loose together.
 
-A single contact is not integrated. Against its normal impulse p gap velocity and slip are straight
-lines, with one kink where slip stops, and the work of the force is a sum of parabolas
-(`_next_piece`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, here with energetic
-restitution).
+A single contact is not integrated. Against its normal impulse p gap velocity and slip
+are straight lines, with one kink where slip stops, and the work of the force is a sum
+of parabolas (`_next_piece`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897,
+here with energetic restitution).
 """
 
 import dataclasses
@@ -42,27 +42,32 @@ from jimpact.numerics.stepper import any_of
 from jimpact.tools.loops import cond, fori_loop
 from jimpact.tools.precision import precision
 
-# part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
-# stick: those of a moment later do. Ten times more would decide by later forces.
+# part of the unit of time. At the first touch forces are 0 and cannot decide which
+# contacts stick: those of a moment later do. Ten times more would decide by later
+# forces.
 MOMENT = 1e-6
-# Pieces of a single contact's impact, at most: it expands, is compressed, its slip stops, it turns.
-# Ten times more would change nothing.
+# Pieces of a single contact's impact, at most: it expands, is compressed, its slip
+# stops, it turns. Ten times more would change nothing.
 PIECES = 4
-# of the tolerance: the impact is over where no contact has more energy, loaded ones included. Ten
-# times more is the energy of one tolerance of velocity, which would be lost.
+# of the tolerance: the impact is over where no contact has more energy, loaded ones
+# included. Ten times more is the energy of one tolerance of velocity, which would be
+# lost.
 LEFT = 0.1
 
 
-# Closings of a contact from which on it is wedged if it hardly moves at the end. Ten times
-# more: ends of fewer closings stay coarse; ten times less: contacts that come to rest otherwise.
+# Closings of a contact from which on it is wedged if it hardly moves at the end. Ten
+# times
+# more: ends of fewer closings stay coarse; ten times less: contacts that come to rest
+# otherwise.
 WEDGED = 100
 
 
 def ridge(dtype: Any) -> float:
-    """Weight of sum lambda^2 / (mu F), which forces of sticking minimize, added to K_tt.
+    """Weight of sum lambda^2 / (mu F), which forces of sticking minimize, added to
+    K_tt.
 
-    It matters only where K_tt is singular. A refinement removes its effect elsewhere, so that
-    errors are least at the square root of the machine epsilon.
+    It matters only where K_tt is singular. A refinement removes its effect elsewhere,
+    so that errors are least at the square root of the machine epsilon.
     """
     return precision(dtype).root
 
@@ -84,7 +89,8 @@ class FrictionForces(NamedTuple):
     normal: Float[Array, "m B"]  # F
     side: Float[Array, "m B"]  # lambda
     rate: Float[Array, "m B"]  # u'
-    room: Float[Array, "m B"]  # in the cone, of those that stick: 0 on it, 1 without lambda
+    # in the cone, of those that stick: 0 on it, 1 without lambda
+    room: Float[Array, "m B"]
 
 
 @as_pytree
@@ -130,10 +136,11 @@ class FrictionFlow(ContactFlow):
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "n #B"] | float:
-        """Allowed error of each row, in tolerances: more of p_t, rounding / weight (`ridge`).
+        """Allowed error of each row, in tolerances: more of p_t, rounding / weight
+        (`ridge`).
 
-        The sharing of tangential forces is no more accurate. It changes no velocity, and all else
-        of lambda is linear in F while the modes last.
+        The sharing of tangential forces is no more accurate. It changes no velocity,
+        and all else of lambda is linear in F while the modes last.
         """
         m = self.contacts
         shares = (np.arange(len(y)) // m == 4)[:, None]
@@ -145,7 +152,9 @@ class FrictionFlow(ContactFlow):
         return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
 
     def constants(self, modes: Int[Array, "modes B"]) -> Any:
-        """Factors of the normal field and of friction: who sticks, lambda / F of the others."""
+        """Factors of the normal field and of friction: who sticks, lambda / F of the
+        others.
+        """
         m = self.contacts
         slip = modes[2 * m :]
         stick = (slip == 0) & self.loaded(modes)
@@ -161,42 +170,56 @@ class FrictionFlow(ContactFlow):
         )
 
     def ridges(self) -> Float[Array, "m B"]:
-        """`ridge sqrt(K_tt jj)`: forces of contacts that move alike are then in proportion to mu F.
+        """`ridge sqrt(K_tt jj)`: forces of contacts that move alike are then in
+        proportion to mu F.
 
-        Each contact has units of its own (`dimensionless`), in which the rows of K_tt of such
-        contacts are multiples of each other.
+        Each contact has units of its own (`dimensionless`), in which the rows of K_tt
+        of such contacts are multiples of each other.
         """
         rows = np.arange(self.contacts)
         own = self.tangent[rows, rows]
         movable = own > 0
-        return ridge(own.dtype) * jnp.where(movable, jnp.sqrt(jnp.where(movable, own, 1.0)), 1.0)
+        return ridge(own.dtype) * jnp.where(
+            movable, jnp.sqrt(jnp.where(movable, own, 1.0)), 1.0
+        )
 
-    def forces(self, const: FrictionConstants, y: Float[Array, "driving B"]) -> FrictionForces:
+    def forces(
+        self, const: FrictionConstants, y: Float[Array, "driving B"]
+    ) -> FrictionForces:
         """Forces F and lambda in a state, rates u' of slip, and margins of sticking.
 
-        Sliding: `lambda = drag F`; sticking: `K_tt lambda = -pull F` for them, shared in proportion
-        to mu F where K_tt is singular.
+        Sliding: `lambda = drag F`; sticking: `K_tt lambda = -pull F` for them, shared
+        in proportion to mu F where K_tt is singular.
         """
         x, g, _ = self.rows(y)
         f = self.force(const.frozen, x, g)
-        most, pull = self.friction * f, times(const.pull, f)
+        most = self.friction * f
+        pull = times(const.pull, f)
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
         weight = load_shares(most)
         right = jnp.where(const.stick, -pull, 0.0)
         held = regularized_once(const.tangent * weight[None], const.ridge, right)
-        hold, size = weight * held, jnp.abs(held)
+        hold = weight * held
+        size = jnp.abs(held)
         # in parts of the force: those of a contact that opens vanish together
         some = const.stick & (largest + size > 0)
-        room = jnp.where(some, (largest - size) / jnp.where(some, largest + size, 1.0), 1.0)
+        room = jnp.where(
+            some, (largest - size) / jnp.where(some, largest + size, 1.0), 1.0
+        )
         rate = jnp.where(const.stick, 0.0, pull + times(self.tangent, hold))
         return FrictionForces(f, const.drag * f + hold, rate, room)
 
     def field(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "n B"]:
-        """Rates of x, g, p, slip, its impulse and time: `g' = ratio (G F + K_nt lambda)`."""
-        frozen, forces = const.frozen, self.forces(const, y)
-        pull = self.coupling.times(forces.normal) + times(self.normal_tangent, forces.side)
+        """Rates of x, g, p, slip, its impulse and time:
+        `g' = ratio (G F + K_nt lambda)`.
+        """
+        frozen = const.frozen
+        forces = self.forces(const, y)
+        pull = self.coupling.times(forces.normal) + times(
+            self.normal_tangent, forces.side
+        )
         return jnp.concatenate(
             [
                 frozen.closing * self.rows(y)[1],
@@ -211,7 +234,9 @@ class FrictionFlow(ContactFlow):
     def margins(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "k B"]:
-        """Margins of the normal flow, speeds of slip, distances to the friction cones (m each)."""
+        """Margins of the normal flow, speeds of slip, distances to the friction cones
+        (m each).
+        """
         m = self.contacts
         slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
@@ -223,16 +248,24 @@ class FrictionFlow(ContactFlow):
         )
 
     def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "k B"]:
-        """Mask of the openings, as in the normal flow; margins of friction have no root."""
+        """Mask of the openings, as in the normal flow; margins of friction have no
+        root.
+        """
         rooted = super().rooted(modes)
         return jnp.concatenate([rooted, jnp.zeros_like(rooted)])
 
     def switch(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state after events: slip that stops and stick that breaks included."""
+        """Modes and state after events: slip that stops and stick that breaks
+        included.
+        """
         m = self.contacts
-        stopped, broke = which[2 * m : 3 * m], which[3 * m :]
+        stopped = which[2 * m : 3 * m]
+        broke = which[3 * m :]
         side = self.forces(self.constants(modes), y).side
         turned = jnp.where(broke, -jnp.sign(side).astype(modes.dtype), modes[2 * m :])
         after, y = self.normal_switch(modes, y, which[: 2 * m])
@@ -247,13 +280,16 @@ class FrictionFlow(ContactFlow):
         stopped: Bool[Array, "m B"],
         closed: Bool[Array, "m B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state once it is decided which contacts stick, and where others slide to.
+        """Modes and state once it is decided which contacts stick, and where others
+        slide to.
 
-        `distribute` decides anew where slip has `stopped`, or a contact has `closed` without slip,
-        from the forces of a moment later.
+        `distribute` decides anew where slip has `stopped`, or a contact has `closed`
+        without slip, from the forces of a moment later.
         """
         m = self.contacts
-        u, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
+        u = self.slip(y)
+        slip = modes[2 * m :]
+        loaded = self.loaded(modes)
         rests = jnp.abs(u) <= SNAP * self.tolerance
         slip = jnp.where(closed & ~rests, jnp.sign(u).astype(slip.dtype), slip)
         resting = loaded & rests & ((slip != 0) | closed)
@@ -264,7 +300,9 @@ class FrictionFlow(ContactFlow):
         most = constant.friction * f
         # b = u' by normal forces and by the friction of contacts that slide on
         slides = jnp.where(to_check | ~loaded, 0.0, -slip.astype(u.dtype) * most)
-        b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f) + times(constant.tangent, slides)
+        b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f) + times(
+            constant.tangent, slides
+        )
         stick, towards = distribute(constant.tangent, b, most, to_check)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(to_check, towards, slip)
@@ -278,13 +316,18 @@ class FrictionFlow(ContactFlow):
         rests: Bool[Array, "m B"],
         most: Float[Array, "m B"],
     ) -> Float[Array, "n B"]:
-        """The state with slips of 0 at contacts that rest; those with `most` = mu F > 0 stick.
+        """The state with slips of 0 at contacts that rest; those with `most` = mu F > 0
+        stick.
 
-        Slips are nothing there, but their tangents are not: those of a contact that sticks are
-        taken by a tangential impulse, of one that begins to slide they remain.
+        Slips are nothing there, but their tangents are not: those of a contact that
+        sticks are taken by a tangential impulse, of one that begins to slide they
+        remain.
         """
-        m, (x, g, p), u = self.contacts, self.rows(y), self.slip(y)
-        weight, holds = load_shares(most), most > 0
+        m = self.contacts
+        x, g, p = self.rows(y)
+        u = self.slip(y)
+        weight = load_shares(most)
+        holds = most > 0
         soft = jnp.where(holds, ridge(u.dtype), 1.0)
         right = jnp.where(holds, -u, 0.0)
         side = weight * regularized_once(self.tangent * weight[None], soft, right)
@@ -300,7 +343,9 @@ class FrictionFlow(ContactFlow):
         scale = self.scales(modes)
         return jnp.where(scale > 0, gamma / jnp.where(scale > 0, scale, 1.0), 0.0)
 
-    def soon(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> Float[Array, "m B"]:
+    def soon(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "m B"]:
         """Normal forces a MOMENT later, in parts of the largest."""
         const = self.normal_constants(modes)
         x, g, _ = self.rows(y)
@@ -308,13 +353,20 @@ class FrictionFlow(ContactFlow):
         top = jnp.max(f, axis=0, keepdims=True)
         return f / jnp.where(top > 0, top, 1.0)
 
-    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
+    def contact_states(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> ContactStates:
         """Forces, velocities and slip in a state."""
-        m, side = self.contacts, self.forces(self.constants(modes), y).side
+        m = self.contacts
+        side = self.forces(self.constants(modes), y).side
         return (
             super()
             .contact_states(modes, y)
-            ._replace(tangential_force=side, tangential_impulse=y[4 * m : 5 * m], slip=self.slip(y))
+            ._replace(
+                tangential_force=side,
+                tangential_impulse=y[4 * m : 5 * m],
+                slip=self.slip(y),
+            )
         )
 
     def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
@@ -335,7 +387,10 @@ class FrictionFlow(ContactFlow):
         return super().at_once and self.normal_tangent.shape[1] == 1
 
     def over(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], passes: Float[Array, "1 B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"]:
         """Mask: no contact is loaded or approaches."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
@@ -344,7 +399,9 @@ class FrictionFlow(ContactFlow):
     def finish(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state with indentations of 0, after the impulses of a single contact."""
+        """Modes and state with indentations of 0, after the impulses of a single
+        contact.
+        """
         if self.at_once:
             return modes, self._after_one(modes, y)
         m = self.contacts
@@ -356,8 +413,11 @@ class FrictionFlow(ContactFlow):
             jnp.any(wedged), lambda: self.unwedged(modes, ended, wedged), lambda: ended
         )
 
-    def wedged(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> Bool[Array, "m B"]:
-        """Mask of contacts that hardly move, where one closed WEDGED times: they decay to 0.
+    def wedged(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Bool[Array, "m B"]:
+        """Mask of contacts that hardly move, where one closed WEDGED times: they decay
+        to 0.
 
         Those that closed often, and those that still approach.
         """
@@ -369,25 +429,35 @@ class FrictionFlow(ContactFlow):
         return (often | approaches) & any_of(often)
 
     def unwedged(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], wedged: Bool[Array, "m B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        wedged: Bool[Array, "m B"],
     ) -> Float[Array, "n B"]:
         """The state in the limit of the `wedged` contacts, where friction permits it.
 
-        With the impulses p and q that are left, `gamma + G p + K_nt q = 0` of these contacts, and
-        `u + K_tn p + K_tt q = 0` where slip is as small, else `q = -mu p sign(u)`; p = q = 0 of
-        others. What does not stop within its cone slides. The state remains where that needs p < 0
-        or |q| > mu p.
+        With the impulses p and q that are left, `gamma + G p + K_nt q = 0` of these
+        contacts, and `u + K_tn p + K_tt q = 0` where slip is as small, else
+        `q = -mu p sign(u)`; p = q = 0 of others. What does not stop within its cone
+        slides. The state remains where that needs p < 0 or |q| > mu p.
         """
-        m, (x, g, p), u = self.contacts, self.rows(y), self.slip(y)
+        m = self.contacts
+        x, g, p = self.rows(y)
+        u = self.slip(y)
         stops = wedged & (jnp.abs(u) <= WIDENED * self.tolerance)
         eye = unit(self.tangent)
         coupling = self.coupling.dense(m)
-        across, back = self.normal_tangent, jnp.swapaxes(self.normal_tangent, 0, 1)
+        across = self.normal_tangent
+        back = jnp.swapaxes(self.normal_tangent, 0, 1)
         drag = self.friction * jnp.sign(jax.lax.stop_gradient(u))
         gamma = self.scales(modes) * g
 
-        def solved(stops: Bool[Array, "m B"]) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
-            """Impulses p and q that are left where the contacts `stops` have no slip."""
+        def solved(
+            stops: Bool[Array, "m B"],
+        ) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
+            """Impulses p and q that are left where the contacts `stops` have no
+            slip.
+            """
             slides = (wedged & ~stops)[:, None]
             rubs = jnp.where(slides, eye * drag[:, None], 0.0)
             lower = [
@@ -396,19 +466,24 @@ class FrictionFlow(ContactFlow):
             ]
             normal = jnp.where(wedged[:, None], coupling, eye)
             upper = [normal, jnp.where(wedged[:, None], across, 0.0)]
-            matrix = jnp.concatenate([jnp.concatenate(z, axis=1) for z in (upper, lower)])
+            matrix = jnp.concatenate(
+                [jnp.concatenate(z, axis=1) for z in (upper, lower)]
+            )
             right = [jnp.where(wedged, -gamma, 0.0), jnp.where(stops, -u, 0.0)]
             left = solve(matrix, jnp.concatenate(right)[:, None])[:, 0]
             return left[:m], left[m:]
 
-        def above(dp: Float[Array, "m B"], dq: Float[Array, "m B"]) -> Bool[Array, "m B"]:
+        def above(
+            dp: Float[Array, "m B"], dq: Float[Array, "m B"]
+        ) -> Bool[Array, "m B"]:
             """Mask of contacts beyond their cones."""
             return jnp.abs(dq) > self.friction * jnp.abs(dp) + SNAP * self.tolerance
 
         first = above(*solved(stops))
         dp, dq = solved(stops & ~first)
         fails = any_of(~jnp.isfinite(dp + dq) | (dp < 0) | above(dp, dq))
-        dp, dq = jnp.where(fails, 0.0, dp), jnp.where(fails, 0.0, dq)
+        dp = jnp.where(fails, 0.0, dp)
+        dq = jnp.where(fails, 0.0, dq)
         g = g + self.as_rows(modes, times(coupling, dp) + times(across, dq))
         u = u + times(back, dp) + times(self.tangent, dq)
         return jnp.concatenate([x, g, p + dp, u, y[4 * m : 5 * m] + dq, y[5 * m :]])
@@ -418,12 +493,18 @@ class FrictionFlow(ContactFlow):
     ) -> Float[Array, "n B"]:
         """The state after the impact of a single contact, in closed form.
 
-        With its normal impulse p gamma grows at the rate `1 + K_nt r`, u at `K_nt + K_tt r`, where
-        r = lambda / F: `drag` until slip stops, from then on `hold`, -K_nt / K_tt within the cone.
+        With its normal impulse p gamma grows at the rate `1 + K_nt r`, u at
+        `K_nt + K_tt r`, where r = lambda / F: `drag` until slip stops, from then on
+        `hold`, -K_nt / K_tt within the cone.
         """
         works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
-        (x, _, p), u, slip = self.rows(y), self.slip(y), modes[2:]
-        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction  # K_nt, K_tt, mu
+        x, _, p = self.rows(y)
+        u = self.slip(y)
+        slip = modes[2:]
+        # K_nt, K_tt, mu
+        across = self.normal_tangent[0]
+        own = self.tangent[0]
+        mu = self.friction
         drag = -slip.astype(u.dtype) * mu
         movable = own > 0
         hold = jnp.where(movable, -across / jnp.where(movable, own, 1.0), 0.0)
@@ -435,18 +516,30 @@ class FrictionFlow(ContactFlow):
         length = jnp.where(slip == 0, 0.0, length)
         twice = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
         slopes = 1 + across * drag, 1 + across * hold
-        start = SingleContact(jnp.where(works, gamma, -1.0), twice, length, 0 * p, 0 * p)
-        end = fori_loop(0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start)
+        start = SingleContact(
+            jnp.where(works, gamma, -1.0), twice, length, 0 * p, 0 * p
+        )
+        end = fori_loop(
+            0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start
+        )
         side = drag * end.sliding + hold * end.holding
         side = jnp.where(works, side, 0.0)
         dp = jnp.where(works, end.sliding + end.holding, 0.0)
         gamma = jnp.where(works, end.gap_velocity, gamma)
-        rows = [jnp.zeros_like(x), gamma, p + dp, u + across * dp + own * side, y[4:5] + side]
+        rows = [
+            jnp.zeros_like(x),
+            gamma,
+            p + dp,
+            u + across * dp + own * side,
+            y[4:5] + side,
+        ]
         return jnp.concatenate([*rows, y[5:]])
 
 
 class SingleContact(NamedTuple):
-    """A single contact during its impact, and the normal impulses that it has carried."""
+    """A single contact during its impact, and the normal impulses that it has
+    carried.
+    """
 
     gap_velocity: Float[Array, "1 B"]
     energy: Float[Array, "1 B"]  # twice what is stored; 0: it is unloaded
@@ -460,23 +553,33 @@ def _next_piece(
     slopes: tuple[Float[Array, "1 B"], Float[Array, "1 B"]],
     e: Float[Array, "1 B"],
 ) -> SingleContact:
-    """The contact after its slip stops, it turns, or is unloaded; as it is where it is unloaded.
+    """The contact after its slip stops, it turns, or is unloaded; as it is where it is
+    unloaded.
 
-    gamma grows with the impulse at the rates `slopes`, until slip stops and from then on. While it
-    is compressed, energy grows as -gamma^2 / slope; while it expands, it falls e^-2 times as fast.
+    gamma grows with the impulse at the rates `slopes`, until slip stops and from then
+    on. While it is compressed, energy grows as -gamma^2 / slope; while it expands, it
+    falls e^-2 times as fast.
     """
-    gamma, energy, slides = s.gap_velocity, s.energy, s.left > 0
-    slope, most = jnp.where(slides, *slopes), jnp.where(slides, s.left, jnp.inf)
+    gamma = s.gap_velocity
+    energy = s.energy
+    slides = s.left > 0
+    slope = jnp.where(slides, *slopes)
+    most = jnp.where(slides, s.left, jnp.inf)
     closes = (gamma < 0) | ((gamma == 0) & (slope < 0))  # is compressed
     expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
     # gamma reaches 0, and: the expansion starts from gamma = 0
-    turns, rising = closes & (slope > 0), expands & (gamma == 0)
-    some, up = jnp.where(expands, energy, 1.0), jnp.where(turns | rising, slope, 1.0)
+    turns = closes & (slope > 0)
+    rising = expands & (gamma == 0)
+    some = jnp.where(expands, energy, 1.0)
+    up = jnp.where(turns | rising, slope, 1.0)
     square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * energy, 1.0)
     back = square <= 0  # gamma falls to 0 before the energy does
-    # unloaded at gamma = end = sqrt(square), after the impulse e^2 energy / (gamma + end);
+    # unloaded at gamma = end = sqrt(square), after the impulse e^2 energy / (gamma +
+    # end);
     # from gamma = 0 the end is a multiple of e: regular at e = 0
-    end = jnp.where(rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square)))
+    end = jnp.where(
+        rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square))
+    )
     whole = e**2 * some / jnp.where(expands & ~rising & ~back, gamma + end, 1.0)
     whole = jnp.where(rising, e * jnp.sqrt(some / up), whole)
     length = jnp.where(back, -gamma / jnp.where(back, slope, 1.0), whole)
@@ -484,7 +587,9 @@ def _next_piece(
     reached = length <= most
     dp = jnp.where(closes | expands, jnp.where(reached, length, most), 0.0)
     unloaded = expands & reached & ~back
-    after = jnp.where(unloaded, end, jnp.where(reached & (turns | back), 0.0, gamma + slope * dp))
+    after = jnp.where(
+        unloaded, end, jnp.where(reached & (turns | back), 0.0, gamma + slope * dp)
+    )
     share = jnp.where(expands & ~unloaded, e**2, 1.0)
     return SingleContact(
         gap_velocity=after,

@@ -1,8 +1,11 @@
-"""The dynamics of an impact in its natural units: results do not depend on the user's units.
+"""The dynamics of an impact in its natural units: results do not depend on the user's
+units.
 
-With Q the largest normalized approach velocity (or stored energy) of the impact, contact j has
+With Q the largest normalized approach velocity (or stored energy) of the impact,
+contact j has
 
-    x_ref,j = ((eta_j + 1) Q^2 / (2 k_j))^(1 / (eta_j + 1)),   t_ref,j = x_ref,j / (Q sqrt(W_jj))
+    x_ref,j = ((eta_j + 1) Q^2 / (2 k_j))^(1 / (eta_j + 1)),   t_ref,j = x_ref,j / (Q
+    sqrt(W_jj))
 
 and omega_j = T / t_ref,j with T the smallest t_ref: the flow of `contact_flow.py`.
 """
@@ -38,39 +41,54 @@ from jimpact.numerics.sparse import Neighbours
 from jimpact.numerics.step_impulses import descent_lengths
 from jimpact.numerics.tangential import TangentialBlock
 from jimpact.numerics.tangents import Dual, is_dual, pushforward, value_of
-from jimpact.numerics.tridiagonal import Structure, Symmetric, diagonal, off_diagonal, scaled
+from jimpact.numerics.tridiagonal import (
+    Structure,
+    Symmetric,
+    diagonal,
+    off_diagonal,
+    scaled,
+)
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
-# Tolerance of a run with derivatives, as a multiple of that of values: derivatives are one or two
-# digits worse at the same one. At order 8 these two digits cost a third more steps; ten times more
-# would lose one of them.
+# Tolerance of a run with derivatives, as a multiple of that of values: derivatives are
+# one or two digits worse at the same one. At order 8 these two digits cost a third more
+# steps; ten times more would lose one of them.
 GRADIENT_TIGHTENING = 0.01
 NO_SECOND = (
-    "Argument `method` must be 'time' for second derivatives, but has value 'implicit', or 'auto', "
-    "which is 'implicit' for several contacts with friction in space: steps that do not end at "
+    "Argument `method` must be 'time' for second derivatives, but has value "
+    "'implicit', or 'auto', "
+    "which is 'implicit' for several contacts with friction in space: steps that do "
+    "not end at "
     "events have first derivatives only."
 )
 IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost more
-# A contact slower than the fastest by more than this factor sees many of its periods, whose errors
-# add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
+# A contact slower than the fastest by more than this factor sees many of its periods,
+# whose errors add up, so the tolerance falls with their number. Ten times more: it
+# begins to fall too late.
 WIDE_SPREAD = 5.0
 METHODS = ("auto", "time", "implicit")
-# Contacts with friction in space up to which 'auto' is 'time'. More of them change between stick
-# and slip thousands of times, one after the other: already of two, some impacts do not end.
+# Contacts with friction in space up to which 'auto' is 'time'. More of them change
+# between stick and slip thousands of times, one after the other: already of two, some
+# impacts do not end.
 EXACT_CONTACTS = 1
-# Tolerance of the second run that shows how well an outcome is conditioned, as a multiple of that
-# of the first one: FINER, or APART coarser where the precision allows none so fine. Ten times more:
-# runs that differ too little, or the error of a coarse one.
-FINER, APART = 0.01, 3.0
-# Difference between the two runs, in `rtol`, from which on an outcome is ill-conditioned. Ten times
-# more: errors of 100 tolerances are not reported.
+# Tolerance of the second run that shows how well an outcome is conditioned, as a
+# multiple of that of the first one: FINER, or APART coarser where the precision allows
+# none so fine. Ten times more: runs that differ too little, or the error of a coarse
+# one.
+FINER = 0.01
+APART = 3.0
+# Difference between the two runs, in `rtol`, from which on an outcome is
+# ill-conditioned. Ten times more: errors of 100 tolerances are not reported.
 ILL = 10.0
-DENSE_CHAIN = 4  # contacts up to which a dense product is faster than shifts by one contact
+# contacts up to which a dense product is faster than shifts by one contact
+DENSE_CHAIN = 4
 
 
 class Problem(NamedTuple):
-    """Data of the dimensionless outcome, of one impact or of a batch in the last axis."""
+    """Data of the dimensionless outcome, of one impact or of a batch in the last
+    axis.
+    """
 
     off_diagonal: Float[Array, "..."]  # of G, see `off_diagonal`
     omega: Float[Array, "m *B"]
@@ -81,7 +99,8 @@ class Problem(NamedTuple):
     gap: Float[Array, "m *B"] | None  # in units of the indentation
     tolerance: Float[Array, "1 *B"]
     taking_part: Float[Array, "1 *B"]  # contacts that are not open for good
-    step: Float[Array, "1 *B"]  # of the impulse form: the tolerance, whatever the stiffnesses
+    # of the impulse form: the tolerance, whatever the stiffnesses
+    step: Float[Array, "1 *B"]
     viscous: Viscous | None = None
     tangential: "Tangential | None" = None
     limit: Float[Array, "m *B"] | None = None  # indentation at which the force stays
@@ -121,8 +140,11 @@ def dimensionless(
     gaps: Float[Array, " m"] | None = None,
     closed: Bool[Array, " m"] | None = None,
 ) -> tuple[Problem, ImpactUnits]:
-    """The dimensionless problem and its units; `stored` energies [J], `closed`: who takes part."""
-    m, dtype = gamma.shape[0], gamma.dtype
+    """The dimensionless problem and its units; `stored` energies [J], `closed`: who
+    takes part.
+    """
+    m = gamma.shape[0]
+    dtype = gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
     qn = gamma / root
@@ -140,7 +162,10 @@ def dimensionless(
     g = scaled(delassus, 1 / root)
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    count = jnp.full((), m, dtype) if closed is None else jnp.sum(closed, dtype=dtype)
+    if closed is None:
+        count = jnp.full((), m, dtype)
+    else:
+        count = jnp.sum(closed, dtype=dtype)
     count = jnp.maximum(count, 1)
     step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
     problem = Problem(
@@ -155,7 +180,9 @@ def dimensionless(
         taking_part=count[None],
         step=step[None],
     )
-    return problem, ImpactUnits(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
+    return problem, ImpactUnits(
+        q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest)
+    )
 
 
 def tangential_of(
@@ -164,20 +191,34 @@ def tangential_of(
     stiffness: Float[Array, ""] | Float[Array, " m"] | None,
     units: ImpactUnits,
 ) -> Tangential:
-    """The tangential block of the contacts in the units of the normal one, mu, kappa or None."""
+    """The tangential block of the contacts in the units of the normal one, mu, kappa or
+    None.
+    """
     assert contact.tangential_block is not None  # see `check_law`
     block = contact.tangential_block.scaled(units.root, units.velocity)
     ones = jnp.ones_like(units.root)
-    kappa = None if stiffness is None else stiffness * ones
+    if stiffness is None:
+        kappa = None
+    else:
+        kappa = stiffness * ones
     return Tangential(block, friction * ones, kappa)
 
 
 def normal_coupling(problem: Problem, structure: Structure) -> Float[Array, "m m B"]:
     """G with unit diagonal, from the entries above it: all, or G_j,j+1 of a chain."""
-    m, (_, *batch) = problem.omega.shape[0], problem.omega.shape
+    m = problem.omega.shape[0]
+    _, *batch = problem.omega.shape
     chain = structure == "chain"
-    i, j = (jnp.arange(m - 1), jnp.arange(1, m)) if chain else jnp.triu_indices(m, 1)
-    upper = jnp.zeros((m, m, *batch), problem.omega.dtype).at[i, j].set(problem.off_diagonal)
+    if chain:
+        i = jnp.arange(m - 1)
+        j = jnp.arange(1, m)
+    else:
+        i, j = jnp.triu_indices(m, 1)
+    upper = (
+        jnp.zeros((m, m, *batch), problem.omega.dtype)
+        .at[i, j]
+        .set(problem.off_diagonal)
+    )
     return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
 
 
@@ -190,8 +231,12 @@ def coupling_of(problem: Problem, structure: Structure) -> Coupling:
     return Dense(normal_coupling(problem, structure))
 
 
-def first_indentation(problem: Problem, exponent: Exponent | None) -> Float[Array, "m *B"]:
-    """Indentations before the impact: `energy^(1 / (eta + 1))` if loaded, else minus the gap."""
+def first_indentation(
+    problem: Problem, exponent: Exponent | None
+) -> Float[Array, "m *B"]:
+    """Indentations before the impact: `energy^(1 / (eta + 1))` if loaded, else minus
+    the gap.
+    """
     eta: Any = exponent if problem.exponent is None else problem.exponent
     loaded = problem.energy > 0
     energy = jnp.where(loaded, problem.energy, 1.0)
@@ -201,10 +246,16 @@ def first_indentation(problem: Problem, exponent: Exponent | None) -> Float[Arra
 
 
 def flow_of(
-    problem: Problem, exponent: Exponent | None, structure: Structure, tighten: float = 1.0
+    problem: Problem,
+    exponent: Exponent | None,
+    structure: Structure,
+    tighten: float = 1.0,
 ) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
-    """The flow of a problem with a batch in the last axis, its first modes and state."""
-    m, viscous = problem.omega.shape[0], problem.viscous
+    """The flow of a problem with a batch in the last axis, its first modes and
+    state.
+    """
+    m = problem.omega.shape[0]
+    viscous = problem.viscous
     parts: dict[str, Any] = dict(
         coupling=coupling_of(problem, structure),
         omega=problem.omega,
@@ -220,14 +271,19 @@ def flow_of(
     )
     x = first_indentation(problem, exponent)
     if problem.tangential is None:
-        flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
+        flow = ContactFlow(
+            **parts, watches=tighten < 1 and problem.exponent is not None
+        )
         return flow, *flow.start(problem.gamma, x)
     (normal_tangent, tangent, slip), friction, kappa = problem.tangential
     parts |= dict(normal_tangent=normal_tangent, tangent=tangent, friction=friction)
     if kappa is not None:
         springs = SpringFlow(**parts, tangential_stiffness=kappa)
         return springs, *springs.start_with(problem.gamma, x, slip)
-    kind = FrictionFlow if len(slip) == m else SlipFlow
+    if len(slip) == m:
+        kind = FrictionFlow
+    else:
+        kind = SlipFlow
     frictional = kind(**parts)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
@@ -236,8 +292,9 @@ def flow_of(
 class ImpulseProgram:
     """Outcomes from the leaves of a `Problem` with a batch in the last axis.
 
-    Results: p (m, B), p_t (t, B); the time of the last event (of the end where `with_end_time`: no
-    closed form ends it), the status and the number of passes (1, B).
+    Results: p (m, B), p_t (t, B); the time of the last event (of the end where
+    `with_end_time`: no closed form ends it), the status and the number of passes (1,
+    B).
     """
 
     tree: Any
@@ -247,8 +304,10 @@ class ImpulseProgram:
     tangents: int = 0  # tangential impulses
     with_end_time: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    checkpoints: bool = False  # its loops have the reverse mode, in the place of the forward mode
-    queues: ClassVar[bool] = True  # its impacts need not wait for the slowest (`until_over`)
+    # its loops have the reverse mode, in the place of the forward mode
+    checkpoints: bool = False
+    # its impacts need not wait for the slowest (`until_over`)
+    queues: ClassVar[bool] = True
 
     def flow(
         self, problem: Problem, tighten: float
@@ -266,20 +325,28 @@ class ImpulseProgram:
     def results(self, *kinds: Kind) -> tuple[Kind, ...]:
         """Kinds of the results from leaves of these kinds."""
         normal = jax.tree.unflatten(self.tree, kinds).gamma
-        one, code = normal._replace(shape=(1,)), Kind((1,), jnp.dtype(jnp.int32))
+        one = normal._replace(shape=(1,))
+        code = Kind((1,), jnp.dtype(jnp.int32))
         return normal, normal._replace(shape=(self.tangents,)), one, code, code
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
-        tighten = GRADIENT_TIGHTENING if self.finely else 1.0
-        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
+        if self.finely:
+            tighten = GRADIENT_TIGHTENING
+        else:
+            tighten = 1.0
+        flow, modes, y = pushforward(
+            lambda problem: self.flow(problem, tighten), problem
+        )
         gamma = value_of(problem.gamma)
         rows = 3 * gamma.shape[0]
         tangential = slice(-1 - self.tangents, -1)  # the rows before the time
         if value_of(flow).at_once:
             state = pushforward(lambda flow, y: flow.finish(modes, y)[1], flow, y)
-            results = pushforward(lambda y: (y[rows - 1 : rows], y[tangential], y[-1:]), state)
+            results = pushforward(
+                lambda y: (y[rows - 1 : rows], y[tangential], y[-1:]), state
+            )
             none = jnp.full(gamma.shape, CODE["ok"], jnp.int32)
             return *results, none, none
         end = run(flow, gamma, modes, y, self.most, inspect, self.checkpoints)
@@ -287,8 +354,13 @@ class ImpulseProgram:
         p = value_of(state)[rows - len(gamma) : rows] + end.impulse
         if self.finely:
             last = flow, problem.gamma, state
-            plastic = pushforward(lambda f, g, y: final_impulses(f, g, y, end.carries), *last)
-            p = Dual(p, plastic.tangents) if is_dual(plastic) else plastic
+            plastic = pushforward(
+                lambda f, g, y: final_impulses(f, g, y, end.carries), *last
+            )
+            if is_dual(plastic):
+                p = Dual(p, plastic.tangents)
+            else:
+                p = plastic
         rest = pushforward(lambda y: (y[tangential], y[-1:]), state)
         return p, *rest, end.status, end.carry.passes.astype(jnp.int32)
 
@@ -301,15 +373,24 @@ class ImplicitProgram(ImpulseProgram):
         """The values as they are; a second derivative raises."""
         return without_derivatives(values, NotImplementedError(NO_SECOND))
 
-    def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
-        """The contacts of a problem as `ImplicitSteps`, and their state before the impact."""
-        coupling, m = coupling_of(problem, self.structure), problem.omega.shape[0]
-        friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
+    def steps(
+        self, problem: Problem
+    ) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
+        """The contacts of a problem as `ImplicitSteps`, and their state before the
+        impact.
+        """
+        coupling = coupling_of(problem, self.structure)
+        m = problem.omega.shape[0]
+        friction = jnp.zeros_like(problem.omega)
+        velocity = problem.gamma
         sliding = None
         if problem.tangential is not None:
             (across, tangent, slip), friction, _ = problem.tangential
-            back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.structure)
-            rows = [jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))]
+            back = jnp.swapaxes(across, 0, 1)
+            normal = normal_coupling(problem, self.structure)
+            rows = [
+                jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))
+            ]
             coupling = Dense(jnp.concatenate(rows))
             constant = jax.lax.stop_gradient(coupling.matrix)
             sliding = descent_lengths(constant, m, friction_only=True)
@@ -330,14 +411,20 @@ class ImplicitProgram(ImpulseProgram):
         return flow, flow.start(first_indentation(problem, self.exponent), velocity)
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
-        """Normal and tangential impulses (m, B), (t, B), time, status and passes (1, B).
+        """Normal and tangential impulses (m, B), (t, B), time, status and passes (1,
+        B).
 
-        The leaves are those of a `Problem`. Tangents that they carry pass, and `only_first` marks
-        the values beside them, so that a second derivative raises; the reverse mode of kept
-        checkpoints runs the steps again and needs them plain.
+        The leaves are those of a `Problem`. Tangents that they carry pass, and
+        `only_first` marks the values beside them, so that a second derivative raises;
+        the reverse mode of kept checkpoints runs the steps again and needs them plain.
         """
-        values = value_of(leaves) if self.checkpoints else self.only_first(value_of(leaves))
-        first_only = [Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)]
+        if self.checkpoints:
+            values = value_of(leaves)
+        else:
+            values = self.only_first(value_of(leaves))
+        first_only = [
+            Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)
+        ]
         flow, start = pushforward(self.steps, jax.tree.unflatten(self.tree, first_only))
         run = implicit_steps.run(flow, start, self.most, self.checkpoints)
         m = len(value_of(start.indentation))
@@ -345,21 +432,28 @@ class ImplicitProgram(ImpulseProgram):
         impulses = pushforward(lambda p: (p[:m], p[m:]), run.state.impulse)
         return *impulses, run.state.time, self.code(flow, run), run.passes
 
-    def code(self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun) -> Int[Array, "1 B"]:
+    def code(
+        self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun
+    ) -> Int[Array, "1 B"]:
         """Status of a run: max_steps where it has not ended."""
         busy = value_of(flow).busy(value_of(run.state))
         return jnp.where(busy, CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
 
 
-def method_for(method: str, contact: Contact, friction: bool, springs: bool = False) -> str:
-    """The method; for 'auto' 'implicit' of several contacts with friction in space, else 'time'.
+def method_for(
+    method: str, contact: Contact, friction: bool, springs: bool = False
+) -> str:
+    """The method; for 'auto' 'implicit' of several contacts with friction in space,
+    else 'time'.
 
     With tangential `springs` it is 'time', too.
     """
     if method != "auto":
         return method
     in_space = friction and contact.tangents == 2 and not springs
-    return "implicit" if in_space and contact.contacts > EXACT_CONTACTS else "time"
+    if in_space and contact.contacts > EXACT_CONTACTS:
+        return "implicit"
+    return "time"
 
 
 class Dynamics(NamedTuple):
@@ -376,12 +470,16 @@ class Dynamics(NamedTuple):
     @property
     def static_exponent(self) -> float | tuple[float, ...] | None:
         """The exponent that is compiled in, None for an array."""
-        return None if isinstance(self.exponent, jax.Array) else self.exponent
+        if isinstance(self.exponent, jax.Array):
+            return None
+        return self.exponent
 
     @property
     def tangents(self) -> int:
         """Number of tangential rows t."""
-        return 0 if self.problem.tangential is None else self.problem.tangential.block.slip.shape[0]
+        if self.problem.tangential is None:
+            return 0
+        return self.problem.tangential.block.slip.shape[0]
 
     def columns(self) -> tuple[tuple[jax.Array, ...], Any]:
         """The arrays of the problem with the batch last, and its structure."""
@@ -389,7 +487,9 @@ class Dynamics(NamedTuple):
         return tuple(x[..., None] for x in leaves), tree
 
     def program(self, with_end_time: bool = False) -> ImpulseProgram:
-        """The program from `columns` to impulses; `with_end_time`: no closed form ends it."""
+        """The program from `columns` to impulses; `with_end_time`: no closed form ends
+        it.
+        """
         kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
         fixed = self.static_exponent, self.structure, self.max_steps, self.tangents
         return kind(self.columns()[1], *fixed, with_end_time=with_end_time)
@@ -403,13 +503,15 @@ def solve(
     `condition_check`: the contacts, if a second run is to show whether the outcome is
     `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
     """
-    units, problem = dynamics.units, dynamics.problem
+    units = dynamics.units
+    problem = dynamics.problem
     leaves, _ = dynamics.columns()
     if condition_check is not None:
         second = dynamics._replace(problem=perturbed(problem)).columns()[0]
         leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
     p, side, _, code, _ = evaluate(dynamics.program(), leaves, dynamics.adjoint)
-    p, code = p * units.momentum[:, None], code[0]
+    p = p * units.momentum[:, None]
+    code = code[0]
     tangential = None
     if dynamics.tangents > 0:
         rows = dynamics.tangents // len(units.root)
@@ -427,10 +529,17 @@ def is_ill_conditioned(
     code: Int[Array, "2"],
     error: Float[Array, ""],
 ) -> Bool[Array, ""]:
-    """True if velocities of two runs (columns) differ by over ILL `error`, or the second failed."""
-    difference = None if tangential is None else tangential[:, 1] - tangential[:, 0]
+    """True if velocities of two runs (columns) differ by over ILL `error`, or the
+    second failed.
+    """
+    if tangential is None:
+        difference = None
+    else:
+        difference = tangential[:, 1] - tangential[:, 0]
     change = velocity_changes(contact, p[:, 1] - p[:, 0], difference)
-    return ~(jnp.all(jnp.abs(change) <= ILL * error) & (code[1] <= CODE["plastic_limit"]))
+    return ~(
+        jnp.all(jnp.abs(change) <= ILL * error) & (code[1] <= CODE["plastic_limit"])
+    )
 
 
 def perturbed(problem: Problem) -> Problem:
@@ -439,7 +548,8 @@ def perturbed(problem: Problem) -> Problem:
     This shows how far errors grow also where rounding limits them, not the tolerance.
     """
     constant = jax.lax.stop_gradient(problem)
-    gamma, tolerance = constant.gamma, constant.tolerance
+    gamma = constant.gamma
+    tolerance = constant.tolerance
     held = precision(gamma.dtype).noise
     finer = jnp.maximum(FINER * tolerance, held)
     coarser = APART * jnp.maximum(tolerance, held)
@@ -454,16 +564,24 @@ def perturbed(problem: Problem) -> Problem:
 def velocity_changes(
     contact: Contact, p: Float[Array, " m"], p_t: Float[Array, " t"] | None
 ) -> Float[Array, " n"]:
-    """Changes of gap velocities, `W p + W_nt p_t`, then of slip, `W_nt^T p + W_tt p_t` [m/s]."""
+    """Changes of gap velocities, `W p + W_nt p_t`, then of slip, `W_nt^T p + W_tt p_t`
+    [m/s].
+    """
     if p_t is None:
         return contact.delassus @ p
     assert contact.tangential_block is not None
     cross, tangent, _ = contact.tangential_block
-    return jnp.concatenate([contact.delassus @ p + cross @ p_t, cross.T @ p + tangent @ p_t])
+    return jnp.concatenate(
+        [contact.delassus @ p + cross @ p_t, cross.T @ p + tangent @ p_t]
+    )
 
 
-def evaluate(program: ImpulseProgram, leaves: Arrays, adjoint: str = "jacobian") -> Arrays:
-    """`program(*leaves)` in lanes; its derivatives are those of a run at a finer tolerance."""
+def evaluate(
+    program: ImpulseProgram, leaves: Arrays, adjoint: str = "jacobian"
+) -> Arrays:
+    """`program(*leaves)` in lanes; its derivatives are those of a run at a finer
+    tolerance.
+    """
     checkpoints = adjoint == "checkpoints"
     fine = dataclasses.replace(program, finely=True, checkpoints=checkpoints)
     return in_lanes(program, fine, *leaves, adjoint=adjoint)

@@ -1,19 +1,20 @@
 """Do the contacts of a long chain come to rest together? A look ahead.
 
-A chain that loses much energy ends as a block. Waves run back and forth in it, each contact closes
-hundreds of times, and no state returns as a multiple of an earlier one. But momentum is conserved:
-let dp_j be the impulse that contact j still has to carry in the plastic limit. Contact j transfers
-all the momentum between the two parts of the chain that it joins, so that with the impulse p_j(t)
-that it has carried since
+A chain that loses much energy ends as a block. Waves run back and forth in it, each
+contact closes hundreds of times, and no state returns as a multiple of an earlier one.
+But momentum is conserved: let dp_j be the impulse that contact j still has to carry in
+the plastic limit. Contact j transfers all the momentum between the two parts of the
+chain that it joins, so that with the impulse p_j(t) that it has carried since
 
     dp_j - p_j(t) > 0   always: the parts come to rest relative to each other,
     dp_j - p_j(t) < 0   once: they separate.
 
-A look ahead follows p_j(t) by steps without events (`implicit_steps.py`), with errors that are a
-part COARSE of the velocities that are left. Its errors do not matter where p_j never comes close to
-dp_j: where what is left is at least MARGIN times what the contact can deliver alone, out of its
-approach and its stored energy. Then the end is the plastic limit of the state at hand, to all
-digits. Otherwise nothing is concluded, and the law's own steps go on.
+A look ahead follows p_j(t) by steps without events (`implicit_steps.py`), with errors
+that are a part COARSE of the velocities that are left. Its errors do not matter where
+p_j never comes close to dp_j: where what is left is at least MARGIN times what the
+contact can deliver alone, out of its approach and its stored energy. Then the end is
+the plastic limit of the state at hand, to all digits. Otherwise nothing is concluded,
+and the law's own steps go on.
 """
 
 import dataclasses
@@ -32,18 +33,23 @@ from jimpact.events.implicit_steps import (
 from jimpact.numerics.driver import until_over
 from jimpact.numerics.stepper import any_of
 
-# Error of a step, as a part of the largest velocity (or root of energy) that is left. Ten times
-# more: looks see no margin where there is one; ten times less: twice the passes.
+# Error of a step, as a part of the largest velocity (or root of energy) that is left.
+# Ten times more: looks see no margin where there is one; ten times less: twice the
+# passes.
 COARSE = 0.03
-# Approach (or root of energy) of a contact over what it has left to carry; alone, it would carry at
-# most twice its approach. Blocks of 12 to 200 equal balls have 2 to 7, chains of random bodies that
-# were taken for blocks .6. Ten times more: no block is found.
+# Approach (or root of energy) of a contact over what it has left to carry; alone, it
+# would carry at most twice its approach. Blocks of 12 to 200 equal balls have 2 to 7,
+# chains of random bodies that were taken for blocks .6. Ten times more: no block is
+# found.
 MARGIN = 2.0
-# What is left at the end, and what is compared by MARGIN, in errors that the law's tolerance allows
-# in the outcome. Ten times more: contacts that separate by the tolerance count as at rest.
-LEFT, COMPARED = 0.25, 4.0
-# Passes per contact after which nothing is concluded; blocks of 12 to 200 balls took 150 to 400.
-# Ten times more: what does not come to rest is looked at for longer than it is computed.
+# What is left at the end, and what is compared by MARGIN, in errors that the law's
+# tolerance allows in the outcome. Ten times more: contacts that separate by the
+# tolerance count as at rest.
+LEFT = 0.25
+COMPARED = 4.0
+# Passes per contact after which nothing is concluded; blocks of 12 to 200 balls took
+# 150 to 400. Ten times more: what does not come to rest is looked at for longer than it
+# is computed.
 LONGEST = 1000
 
 
@@ -64,7 +70,8 @@ def comes_to_rest(
     dp: Float[Array, "m B"],
     asked: Bool[Array, "1 B"],
 ) -> Bool[Array, "1 B"]:
-    """Mask of the impacts whose contacts of the `block` come to rest, with the impulses dp.
+    """Mask of the impacts whose contacts of the `block` come to rest, with the impulses
+    dp.
 
     No other contact then carries anything. Only the impacts `asked` are looked at.
     """
@@ -97,7 +104,8 @@ def comes_to_rest(
         return asked & look.clear & left & (look.passes < LONGEST * m)
 
     def is_clear(s: ImplicitState) -> Bool[Array, "1 B"]:
-        """Mask: no contact of the block is close to separating, and no other one carries.
+        """Mask: no contact of the block is close to separating, and no other one
+        carries.
 
         Close: `dp - p < MARGIN` times its approach or root of the energy.
         """
@@ -106,7 +114,9 @@ def comes_to_rest(
         return ~any_of(jnp.where(block, close, s.impulse > flow.tolerance))
 
     def coarse_step(steps: ImplicitSteps, look: _Look) -> _Look:
-        """The look after one step tried, with errors that are a part COARSE of what is left."""
+        """The look after one step tried, with errors that are a part COARSE of what is
+        left.
+        """
         live = goes_on(steps, look)
         coarse = dataclasses.replace(steps, tolerance=COARSE * size(look.state))
         state, length, _ = attempt(coarse, look.state, look.length, live)

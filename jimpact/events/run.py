@@ -1,10 +1,14 @@
-"""The loop of every impact: a flow is advanced step by step, from event to event, to its end.
+"""The loop of every impact: a flow is advanced step by step, from event to event, to
+its end.
 
-FLOW    contacts without or with friction (`contact_flow.py`, `friction_flow.py`, `slip.py`)
+FLOW    contacts without or with friction (`contact_flow.py`, `friction_flow.py`,
+`slip.py`)
 STEP    `numerics/stepper.py` tries one, which ends at an event if one lies within it
-PAUSE   where a flow asks for it, `inspect` judges whether the impact will come to rest by itself
+PAUSE   where a flow asks for it, `inspect` judges whether the impact will come to rest
+by itself
         (`plastic_limit.py`), and ends it there
-END     all contacts are open and none approaches: the flow finishes the state in closed form
+END     all contacts are open and none approaches: the flow finishes the state in closed
+form
 """
 
 from collections.abc import Callable
@@ -23,11 +27,14 @@ from jimpact.tools.status import CODE
 
 
 class Rest(NamedTuple):
-    """Contacts that come to rest, and the state of the impact at its last inspection."""
+    """Contacts that come to rest, and the state of the impact at its last
+    inspection.
+    """
 
     contacts: Bool[Array, "m B"]  # whose closings have no end
     carries: Bool[Array, "m B"]  # those of them that carry an impulse
-    # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of the approach
+    # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of
+    # the approach
     rows: Float[Array, "3 m B"]
     closings: Int[Array, "m B"]
     ended: Bool[Array, "1 B"]  # by a state that returned as a part of itself
@@ -76,14 +83,17 @@ class ImpactEnd(NamedTuple):
 
 
 class _OnItsWay(NamedTuple):
-    """An impact on its way: state of the stepper, contacts at rest, what `observe` has kept."""
+    """An impact on its way: state of the stepper, contacts at rest, what `observe` has
+    kept.
+    """
 
     carry: stepper.StepperState
     rest: Rest
     seen: Any
 
 
-# of flow, gamma, state, rest, which impacts (1, B), whether at the end: see `plastic_limit.inspect`
+# of flow, gamma, state, rest, which impacts (1, B), whether at the end: see
+# `plastic_limit.inspect`
 Inspect = Callable[..., Rest]
 Observe = Callable[[Any, stepper.StepperState, jax.Array], Any]
 
@@ -101,7 +111,8 @@ def run(
 ) -> ImpactEnd:
     """The impact from gap velocities gamma to its end, in at most so many passes.
 
-    Parts of `flow` and y that have tangents (see `tangents.py`) give a state with tangents.
+    Parts of `flow` and y that have tangents (see `tangents.py`) give a state with
+    tangents.
 
     Args:
         flow: the contacts, with the batch B of impacts in the last axis of its arrays.
@@ -111,8 +122,8 @@ def run(
         most: passes.
         inspect: asked where a self-similar flow pauses, and at the end of each.
         checkpoints: the loop has a reverse mode, and no forward mode.
-        observe: `observe(seen, state, accept)` follows the states before each step, and which
-            impacts (1, B) accept it.
+        observe: `observe(seen, state, accept)` follows the states before each step, and
+            which impacts (1, B) accept it.
         seen: what `observe` begins with.
     """
 
@@ -134,16 +145,22 @@ def run(
     if is_dual(y):
         slots = min(slots, SLOTS_WITH_TANGENTS)
     last = until_over(
-        lambda _, now: stepper.goes_on(now.carry, most), one_pass, (flow, gamma), start,
-        checkpoints, slots if observe is None else None,
-    )  # fmt: skip
+        lambda _, now: stepper.goes_on(now.carry, most),
+        one_pass,
+        (flow, gamma),
+        start,
+        checkpoints,
+        slots if observe is None else None,
+    )
     return _finished(flow, gamma, last, inspect)
 
 
 def _finished(
     flow: Any, gamma: Float[Array, "m B"], last: _OnItsWay, inspect: Inspect
 ) -> ImpactEnd:
-    """The end of the impact; the flow finishes the state where it has ended by itself."""
+    """The end of the impact; the flow finishes the state where it has ended by
+    itself.
+    """
     carry, rest, seen = last
     over = (carry.mark == Mark.OVER) & ~rest.ended
 

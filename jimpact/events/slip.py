@@ -1,23 +1,28 @@
-"""Contacts with Coulomb friction in space: the flow of `friction_flow.py` with two tangents each.
+"""Contacts with Coulomb friction in space: the flow of `friction_flow.py` with two
+tangents each.
 
 With c = mu F, the direction d of slip, and n at right angles to it, slip u = r d obeys
 
     r' = d . a,   r angle' = n . a,   a = K_tn F + K_tt lambda,   lambda = -c d
 
-whose angle turns at a rate ~ c K_tt / r: stiff where slip is slow. A loaded contact has therefore
-one of three modes, and its two rows of slip mean
+whose angle turns at a rate ~ c K_tt / r: stiff where slip is slow. A loaded contact has
+therefore one of three modes, and its two rows of slip mean
 
     STICKS   0
-    SLIPS    ln r and angle, while the whole field advances in a time that is shortened by
-             1 + sum (|a| + c K_tt) / r over the contacts that slip: no rate is large then, and
-             slip comes to a stop at the FLOOR after a few steps, as ln r falls at a steady rate
-    CREEPS   r and angle, 0 included: r is so small that the direction follows from the forces, to
-             first order in r. It obeys n . a = r angle': the angle is a state that drifts as the
-             solution drifts, and one Newton step corrects the direction.
+    SLIPS    ln r and angle, while the whole field advances in a time that is shortened
+    by
+             1 + sum (|a| + c K_tt) / r over the contacts that slip: no rate is large
+             then, and slip comes to a stop at the FLOOR after a few steps, as ln r
+             falls at a steady rate
+    CREEPS   r and angle, 0 included: r is so small that the direction follows from the
+        forces, to
+             first order in r. It obeys n . a = r angle': the angle is a state that
+             drifts as the solution drifts, and one Newton step corrects the direction.
 
-and of a contact without load the Cartesian slip velocity. Slip sets in by creeping, from r = 0
-where stick ends; where the stiffness c K_tt / r has fallen enough, it SLIPS. Where several contacts
-stick redundantly (two corners of one body) one may reach its cone while others hold it: it
+and of a contact without load the Cartesian slip velocity. Slip sets in by creeping,
+from r = 0 where stick ends; where the stiffness c K_tt / r has fallen enough, it SLIPS.
+Where several contacts stick redundantly (two corners of one body) one may reach its
+cone while others hold it: it
 creeps with r = 0. Sticking forces are eliminated from the field once a step.
 """
 
@@ -47,28 +52,33 @@ class Slip(enum.IntEnum):
     CREEPS = 2
 
 
-# Speeds in tolerances: slip below FLOOR has stopped; contacts below REST may stick when others
-# stop. Ten times more would lose a hundredth, a tenth of the tolerance.
-FLOOR, REST = 1e-3, 1e-2
-# Creep ends where the rate c K_tt / r has fallen to tolerance^-1/2 / CREEP: its direction is wrong
-# by the square of r over that. Ten times more: some real impacts err by 60 tolerances.
+# Speeds in tolerances: slip below FLOOR has stopped; contacts below REST may stick when
+# others stop. Ten times more would lose a hundredth, a tenth of the tolerance.
+FLOOR = 1e-3
+REST = 1e-2
+# Creep ends where the rate c K_tt / r has fallen to tolerance^-1/2 / CREEP: its
+# direction is wrong by the square of r over that. Ten times more: some real impacts err
+# by 60 tolerances.
 CREEP = 0.1
-# Longest step, over the largest rate. A step of order 8 is stable up to 6; beyond, values do not
-# show it, derivatives do.
+# Longest step, over the largest rate. A step of order 8 is stable up to 6; beyond,
+# values do not show it, derivatives do.
 STABLE = 4.0
-# Errors that rows of slip may have: of ln r and angle, however slow the slip; of the angle of
-# creep, in square roots of the tolerance, as it is corrected soon. Ten times more: directions of
-# slow slip become visible in the velocities.
-LOOSE, SLOW_ANGLE = 1e-3, 1e-2
-# Added to the scaled matrix of creep, which is singular where friction does not turn directions
-# back. Ten times more would change regular directions by 1e-9.
+# Errors that rows of slip may have: of ln r and angle, however slow the slip; of the
+# angle of creep, in square roots of the tolerance, as it is corrected soon. Ten times
+# more: directions of slow slip become visible in the velocities.
+LOOSE = 1e-3
+SLOW_ANGLE = 1e-2
+# Added to the scaled matrix of creep, which is singular where friction does not turn
+# directions back. Ten times more would change regular directions by 1e-9.
 LEAST_STIFFNESS = 1e-10
 
 
 class Reduced(NamedTuple):
-    """The field with sticking forces eliminated: `a = pull F + tangent lambda` of those that slide.
+    """The field with sticking forces eliminated: `a = pull F + tangent lambda` of those
+    that slide.
 
-    gamma' = coupling F + normal_tangent lambda;  forces of sticking -(held F + carried lambda).
+    gamma' = coupling F + normal_tangent lambda;  forces of sticking -(held F + carried
+    lambda).
     """
 
     frozen: Frozen
@@ -81,14 +91,17 @@ class Reduced(NamedTuple):
 
 
 class SlipRates(NamedTuple):
-    """Forces and the rates of slip in the flow's own time before it is shortened, t = 2 m."""
+    """Forces and the rates of slip in the flow's own time before it is shortened, t = 2
+    m.
+    """
 
     force: Float[Array, "m B"]  # F
     sliding: Float[Array, "t B"]  # lambda of those that slide
     holding: Float[Array, "t B"]  # lambda of those that stick
     rate: Float[Array, "m 2 B"]  # of the rows of slip
     direction: Float[Array, "m 2 B"]  # of slip
-    turning: Float[Array, "m B"]  # its rate; of those that creep to first order in their deviation
+    # its rate; of those that creep to first order in their deviation
+    turning: Float[Array, "m B"]
     haste: Float[Array, "1 B"]  # >= 1: by how much time is shortened
 
 
@@ -126,32 +139,45 @@ def towards(angle: Float[Array, "m B"]) -> Float[Array, "m 2 B"]:
 
 
 @towards.defjvp
-def _turning(angle: Any, rate: Any) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
+def _turning(
+    angle: Any, rate: Any
+) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
     """Unit vectors `d`, and their tangents `rate n`, n at right angles to d."""
     direction = towards(*angle)
     return direction, perpendicular_to(direction) * rate[0][:, None]
 
 
-def polar(angle: Float[Array, "m B"]) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
+def polar(
+    angle: Float[Array, "m B"],
+) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
     """Unit vectors in this direction, and at right angles to it."""
     direction = towards(angle)
     return direction, perpendicular_to(direction)
 
 
 def turned(
-    vectors: tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]], angle: Float[Array, "m B"]
+    vectors: tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]],
+    angle: Float[Array, "m B"],
 ) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
-    """Unit vectors of `polar`, turned by small angles a, tan(a / 2) ~ a / 2: without a cosine."""
+    """Unit vectors of `polar`, turned by small angles a, tan(a / 2) ~ a / 2: without a
+    cosine.
+    """
     direction, perpendicular = vectors
     half = (angle / 2)[:, None]
-    cosine, sine = (1 - half**2) / (1 + half**2), 2 * half / (1 + half**2)
-    return cosine * direction + sine * perpendicular, cosine * perpendicular - sine * direction
+    cosine = (1 - half**2) / (1 + half**2)
+    sine = 2 * half / (1 + half**2)
+    return (
+        cosine * direction + sine * perpendicular,
+        cosine * perpendicular - sine * direction,
+    )
 
 
 def angle_of(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
     """Angles of directions; 0, without a derivative, of the zero vector."""
     some = (pair[:, 0] != 0) | (pair[:, 1] != 0)
-    return jnp.arctan2(jnp.where(some, pair[:, 1], 0.0), jnp.where(some, pair[:, 0], 1.0))
+    return jnp.arctan2(
+        jnp.where(some, pair[:, 1], 0.0), jnp.where(some, pair[:, 0], 1.0)
+    )
 
 
 def dot(a: Float[Array, "m 2 B"], b: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
@@ -176,7 +202,9 @@ class SlipFlow(FrictionFlow):
         m = self.contacts
         return pairs(y[3 * m : 5 * m])
 
-    def with_slip(self, y: Float[Array, "n B"], q: Float[Array, "m 2 B"]) -> Float[Array, "n B"]:
+    def with_slip(
+        self, y: Float[Array, "n B"], q: Float[Array, "m 2 B"]
+    ) -> Float[Array, "n B"]:
         """The state with these rows of slip."""
         m = self.contacts
         return jnp.concatenate([y[: 3 * m], flat(q), y[5 * m :]])
@@ -196,25 +224,35 @@ class SlipFlow(FrictionFlow):
         self, modes: Int[Array, "modes B"]
     ) -> tuple[Bool[Array, "m B"], Bool[Array, "m B"], Bool[Array, "m B"]]:
         """Masks of the loaded contacts that stick, that slip, and that creep."""
-        slip, loaded = modes[2 * self.contacts :], self.loaded(modes)
+        slip = modes[2 * self.contacts :]
+        loaded = self.loaded(modes)
         sticks, slips, creeps = (loaded & (slip == kind) for kind in Slip)
         return sticks, slips, creeps
 
-    def speed(self, modes: Int[Array, "modes B"], q: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
+    def speed(
+        self, modes: Int[Array, "modes B"], q: Float[Array, "m 2 B"]
+    ) -> Float[Array, "m B"]:
         """Speeds r of slip of loaded contacts; 0 of those that stick."""
         _, slips, creeps = self.sliding(modes)
         return jnp.where(
-            slips, jnp.exp(jnp.where(slips, q[:, 0], 0.0)), jnp.where(creeps, q[:, 0], 0.0)
+            slips,
+            jnp.exp(jnp.where(slips, q[:, 0], 0.0)),
+            jnp.where(creeps, q[:, 0], 0.0),
         )
 
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "n B"]:
-        """Allowed error of each row, in tolerances; of ln r and angle it grows as 1 / r."""
-        m, one = self.contacts, jnp.ones_like(y[: self.contacts])
+        """Allowed error of each row, in tolerances; of ln r and angle it grows as 1 /
+        r.
+        """
+        m = self.contacts
+        one = jnp.ones_like(y[: self.contacts])
         _, slips, creeps = self.sliding(modes)
         relative = LOOSE / self.tolerance
-        steep = jnp.where(slips, jnp.exp(-jnp.where(slips, self.slip(y)[:, 0], 0.0)), 1.0)
+        steep = jnp.where(
+            slips, jnp.exp(-jnp.where(slips, self.slip(y)[:, 0], 0.0)), 1.0
+        )
         steep = jnp.clip(steep, 1.0, jnp.maximum(relative, 1.0))
         turning = jnp.where(creeps, SLOW_ANGLE / jnp.sqrt(self.tolerance), steep)
         rows = flat(jnp.stack([steep, turning], 1))
@@ -223,15 +261,18 @@ class SlipFlow(FrictionFlow):
     # ---- the protocol
 
     def constants(self, modes: Int[Array, "modes B"]) -> Any:
-        """The field without the forces of sticking, which are `-(Z K_tn F + Z K_tt lambda)`.
+        """The field without the forces of sticking, which are
+        `-(Z K_tn F + Z K_tt lambda)`.
 
-        Z is the pseudoinverse of K_tt in the contacts that stick; lambda are the sliding forces.
+        Z is the pseudoinverse of K_tt in the contacts that stick; lambda are the
+        sliding forces.
         """
         stick, slips, creeps = self.sliding(modes)
         free = twice(slips | creeps | ~self.loaded(modes))
         z = pseudoinverse(self.tangent, twice(stick))
         up = jnp.swapaxes(self.normal_tangent, 0, 1)
-        held, carried = product(z, up), product(z, self.tangent)
+        held = product(z, up)
+        carried = product(z, self.tangent)
         coupling = self.coupling.matrix  # type: ignore[union-attr]
         pull = up - product(self.tangent, held)
         tangent = self.tangent - product(self.tangent, carried)
@@ -248,31 +289,41 @@ class SlipFlow(FrictionFlow):
     def motion(
         self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> SlipRates:
-        """Forces, and the rates of slip `r' = d . a`, `angle' = n . a / r` of those that slip."""
+        """Forces, and the rates of slip `r' = d . a`, `angle' = n . a / r` of those
+        that slip.
+        """
         frozen = const.frozen
         x, g, _ = self.rows(y)
         stick, slips, creeps = self.sliding(modes)
-        slides, q = slips | creeps, self.slip(y)
+        slides = slips | creeps
+        q = self.slip(y)
         f = self.force(frozen, x, g)
         c = jnp.where(slides, self.friction * f, 0.0)  # mu F
-        angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
+        angle = jnp.where(slides, q[:, 1], 0.0)
+        r = self.speed(modes, q)
         over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
         frame = polar(angle)
         drift, correction = self._creep(const, modes, y, f, c, frame, over_r)
         direction, perpendicular = turned(frame, correction)
         side = flat(-c[:, None] * direction)
         a = pairs(times(const.pull, f) + times(const.tangent, side))  # u'
-        grows, turns = dot(direction, a), dot(perpendicular, a)  # r' = d . a and r angle' = n . a
+        # r' = d . a and r angle' = n . a
+        grows = dot(direction, a)
+        turns = dot(perpendicular, a)
         rate = jnp.stack(
             [
-                jnp.where(slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)),
+                jnp.where(
+                    slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)
+                ),
                 jnp.where(slips, over_r * turns, drift + correction),
             ],
             1,
         )
         # rows of contacts without load are u itself
         rate = jnp.where(
-            self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
+            self.loaded(modes)[:, None],
+            rate,
+            (frozen.unit * jnp.ones_like(x))[:, None] * a,
         )
         haste = 1 + total(over_r * (length(a) + 2 * self._stiffness(const, c)))
         holding = self._holding(const, stick, f, side)
@@ -280,7 +331,9 @@ class SlipFlow(FrictionFlow):
         return SlipRates(f, side, holding, rate, direction, turning, haste)
 
     def _stiffness(self, const: Reduced, c: Float[Array, "m B"]) -> Float[Array, "m B"]:
-        """Stiffness c K_tt of the angle, K_tt the mean of the two directions of a contact."""
+        """Stiffness c K_tt of the angle, K_tt the mean of the two directions of a
+        contact.
+        """
         rows = np.arange(2 * self.contacts)
         diagonal = pairs(const.tangent[rows, rows])
         return c * (diagonal[:, 0] + diagonal[:, 1]) / 2
@@ -292,7 +345,9 @@ class SlipFlow(FrictionFlow):
         f: Float[Array, "m B"],
         side: Float[Array, "t B"],
     ) -> Float[Array, "t B"]:
-        """Forces of sticking `-(held F + carried lambda)`; rates from rates of F and lambda."""
+        """Forces of sticking `-(held F + carried lambda)`; rates from rates of F and
+        lambda.
+        """
         holding = times(const.held, f)
         if self.contacts > 1:  # one contact alone sticks or slides
             holding = holding + times(const.carried, side)
@@ -313,11 +368,13 @@ class SlipFlow(FrictionFlow):
         frame: tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]],
         over_r: Float[Array, "m B"],
     ) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
-        """Rates at which the directions of creep drift, and their deviation from those of `frame`.
+        """Rates at which the directions of creep drift, and their deviation from those
+        of `frame`.
 
-        `c` is mu F, `frame` the directions d and n, `over_r` 1 / r of the contacts that slip.
-        With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
-        quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
+        `c` is mu F, `frame` the directions d and n, `over_r` 1 / r of the contacts that
+        slip. With G = n . a of all contacts that creep, G' at fixed angles and J =
+        -dG/d angle, the quasi-static solution G = 0 drifts by J^-1 G'. The directions
+        lag behind it by
         (J + diag(r'))^-1 r drift, as r angle' = G and r grows at the rate r'.
         """
         frozen = const.frozen
@@ -329,12 +386,16 @@ class SlipFlow(FrictionFlow):
         def acceleration(
             f: Float[Array, "m B"], side: Float[Array, "m 2 B"]
         ) -> Float[Array, "m 2 B"]:
-            """Accelerations `u' = K_tn F + K_tt lambda` of slip by normal and sliding forces."""
+            """Accelerations `u' = K_tn F + K_tt lambda` of slip by normal and sliding
+            forces.
+            """
             return pairs(times(const.pull, f) + times(const.tangent, flat(side)))
 
         side = -c[:, None] * direction
         a = acceleration(f, side)
-        grows, turns = dot(direction, a), dot(perpendicular, a)  # r' and G
+        # r' and G
+        grows = dot(direction, a)
+        turns = dot(perpendicular, a)
         # G' from the rates of F, of the radii c, and of the directions that slip
         pull = times(const.coupling, f) + times(const.normal_tangent, flat(side))
         rates = (frozen.closing * g, frozen.ratio * pull)
@@ -342,15 +403,20 @@ class SlipFlow(FrictionFlow):
         dc = jnp.where(c > 0, self.friction * df, 0.0)
         swung = (c * over_r * turns)[:, None] * perpendicular
         changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - swung))
-        # J = n K_tt n c + diag(r'), all in units of the largest entry: forces begin at 0
+        # J = n K_tt n c + diag(r'), all in units of the largest entry: forces begin at
+        # 0
         blocks = self._blocks(const)
         j = sum(
-            perpendicular[:, i][:, None] * blocks[:, i, :, k] * perpendicular[:, k][None]
+            perpendicular[:, i][:, None]
+            * blocks[:, i, :, k]
+            * perpendicular[:, k][None]
             for i in range(2)
             for k in range(2)
         )
         j = jnp.where(creeps[:, None] & creeps[None], j * c[None], 0.0)
-        size = jnp.max(jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows), axis=0, keepdims=True)
+        size = jnp.max(
+            jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows), axis=0, keepdims=True
+        )
         size = jnp.where(size > 0, size, 1.0)
         growth = jnp.where(creeps, grows / size, 0.0)
         j, eye = j / size[None], unit(j)
@@ -365,12 +431,19 @@ class SlipFlow(FrictionFlow):
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
-    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
+    def contact_states(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> ContactStates:
         """Forces, velocities and slip in a state."""
-        m, (x, g, p) = self.contacts, self.rows(y)
-        const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
+        m = self.contacts
+        x, g, p = self.rows(y)
+        const = self.constants(modes)
+        loaded = self.loaded(modes)
+        q = self.slip(y)
         motion = self.motion(const, modes, y)
-        cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        cartesian = (
+            self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        )
         return ContactStates(
             force=motion.force,
             indentation=x,
@@ -386,13 +459,17 @@ class SlipFlow(FrictionFlow):
     def field(
         self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "n B"]:
-        """Rates of x, g, p, slip, its impulses and time, all over `haste`: in shortened time.
+        """Rates of x, g, p, slip, its impulses and time, all over `haste`: in shortened
+        time.
 
         Equation: `g' = ratio (G F + K_nt lambda)`, without the forces of sticking in K.
         """
         _, g, _ = self.rows(y)
-        frozen, motion = const.frozen, self.motion(const, modes, y)
-        pull = times(const.coupling, motion.force) + times(const.normal_tangent, motion.sliding)
+        frozen = const.frozen
+        motion = self.motion(const, modes, y)
+        pull = times(const.coupling, motion.force) + times(
+            const.normal_tangent, motion.sliding
+        )
         dy = jnp.concatenate(
             [
                 frozen.closing * g,
@@ -408,7 +485,9 @@ class SlipFlow(FrictionFlow):
     def margins(
         self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "k B"]:
-        """Margins of the normal flow; until slip stops; until stick, or creep, ends (m each)."""
+        """Margins of the normal flow; until slip stops; until stick, or creep, ends (m
+        each).
+        """
         motion = self.motion(const, modes, y)
         return self._margins_of(const, modes, y, motion.force, motion.holding)
 
@@ -424,22 +503,28 @@ class SlipFlow(FrictionFlow):
 
         slip stops   ln r - ln FLOOR tolerance; r + FLOOR tolerance of creep
         stick ends   (mu F - |lambda|) / sum F
-        creep ends   (slow - r) / (slow + |r|), r less 2 FLOOR tolerance; see CREEP for slow
+        creep ends   (slow - r) / (slow + |r|), r less 2 FLOOR tolerance; see CREEP for
+        slow
         """
         r = self.slip(y)[:, 0]
         stick, slips, creeps = self.sliding(modes)
         floor = FLOOR * self.tolerance
         stops = jnp.where(slips, r - jnp.log(floor), jnp.where(creeps, r + floor, 1.0))
-        # all forces of an impact vanish together: the room in the cone is one in parts of them
+        # all forces of an impact vanish together: the room in the cone is one in parts
+        # of them
         size = total(f)
         room = self.friction * f - length(pairs(holding))
         room = jnp.where(size > 0, room / jnp.where(size > 0, size, 1.0), 1.0)
-        stiffness = self._stiffness(const, jnp.where(slips | creeps, self.friction * f, 0.0))
+        stiffness = self._stiffness(
+            const, jnp.where(slips | creeps, self.friction * f, 0.0)
+        )
         slow = CREEP * jnp.sqrt(self.tolerance) * const.frozen.unit * stiffness
         creep = jnp.where(creeps, r, 0.0) - 2 * floor
         slow = (slow - creep) / (slow + jnp.abs(creep))
         ends = jnp.where(stick, room, jnp.where(creeps, slow, 1.0))
-        return jnp.concatenate([self.normal_margins(const.frozen, modes, y), stops, ends])
+        return jnp.concatenate(
+            [self.normal_margins(const.frozen, modes, y), stops, ends]
+        )
 
     def margins_with_rates(
         self,
@@ -451,16 +536,20 @@ class SlipFlow(FrictionFlow):
     ) -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
         """The margins, and their rates from those of the forces.
 
-        Forces of sticking depend on the directions of creep, whose rates are those of first order,
-        but where a step lands on the rim of a cone.
+        Forces of sticking depend on the directions of creep, whose rates are those of
+        first order, but where a step lands on the rim of a cone.
         """
-        m, motion = self.contacts, self.motion(const, modes, y)
+        m = self.contacts
+        motion = self.motion(const, modes, y)
         stick, slips, creeps = self.sliding(modes)
-        (x, g, _), (dx, dg, _) = self.rows(y), self.rows(dy)
+        x, g, _ = self.rows(y)
+        dx, dg, _ = self.rows(dy)
         _, df = jax.jvp(lambda x, g: self.force(const.frozen, x, g), (x, g), (dx, dg))
         dc = jnp.where(slips | creeps, self.friction * df, 0.0)[:, None]
         c = jnp.where(slips | creeps, self.friction * motion.force, 0.0)
-        turned = (c * motion.turning / motion.haste)[:, None] * perpendicular_to(motion.direction)
+        turned = (c * motion.turning / motion.haste)[:, None] * perpendicular_to(
+            motion.direction
+        )
         dside = -flat(dc * motion.direction + turned)
         value, rates = jax.jvp(
             lambda y, f, holding: self._margins_of(const, modes, y, f, holding),
@@ -478,23 +567,36 @@ class SlipFlow(FrictionFlow):
         return value, rates
 
     def switch(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state after events; slip changes its variables with the mode.
 
-        A contact that opens keeps u = r d, one that breaks loose creeps from r = 0, and creep that
-        ends goes on with ln r.
+        A contact that opens keeps u = r d, one that breaks loose creeps from r = 0, and
+        creep that ends goes on with ln r.
         """
         m = self.contacts
-        stopped, ended = which[2 * m : 3 * m], which[3 * m :]
+        stopped = which[2 * m : 3 * m]
+        ended = which[3 * m :]
         stick, slips, creeps = self.sliding(modes)
-        loaded, q, slip = self.loaded(modes), self.slip(y), modes[2 * m :]
-        cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
-        breaks, grows = stick & ended, creeps & ended
-        # a contact breaks loose against the force that held it, Newton's method sees to the rest
+        loaded = self.loaded(modes)
+        q = self.slip(y)
+        slip = modes[2 * m :]
+        cartesian = (
+            self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        )
+        breaks = stick & ended
+        grows = creeps & ended
+        # a contact breaks loose against the force that held it, Newton's method sees to
+        # the rest
         const = self.constants(modes)
         f = self.force(const.frozen, *self.rows(y)[:2])
-        side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * polar(q[:, 1])[0]
+        side = (
+            jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None]
+            * polar(q[:, 1])[0]
+        )
         pulled = pairs(times(const.held, f) + times(const.carried, flat(side)))
         away = angle_of(jnp.where(breaks[:, None], pulled, 0.0))
         logarithm = jnp.log(jnp.where(grows, q[:, 0], 1.0))
@@ -505,7 +607,9 @@ class SlipFlow(FrictionFlow):
         after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
         remains = self.loaded(after)
         q = jnp.where((loaded & ~remains)[:, None], cartesian, q)
-        return self.decided(after, self.with_slip(y, q), stopped & remains, remains & ~loaded)
+        return self.decided(
+            after, self.with_slip(y, q), stopped & remains, remains & ~loaded
+        )
 
     def decided(
         self,
@@ -514,20 +618,25 @@ class SlipFlow(FrictionFlow):
         stopped: Bool[Array, "m B"],
         closed: Bool[Array, "m B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state once it is decided which contacts stick, and where others creep to.
+        """Modes and state once it is decided which contacts stick, and where others
+        creep to.
 
-        `distribute` decides anew where slip has `stopped`, or a contact has `closed` without slip,
-        from the forces of a moment later.
+        `distribute` decides anew where slip has `stopped`, or a contact has `closed`
+        without slip, from the forces of a moment later.
         """
         m = self.contacts
-        q, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
+        q = self.slip(y)
+        slip = modes[2 * m :]
+        loaded = self.loaded(modes)
         stick = loaded & (slip == Slip.STICKS) & ~closed
         r = jnp.where(closed, length(q), self.speed(modes, q))
         resting = loaded & (r <= REST * self.tolerance) & ~stick
         # contacts that close with slip: its Cartesian rows become ln r and angle
         slips = closed & ~resting
         moving = jnp.where(slips[:, None], q, 1.0)
-        q = jnp.where(slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q)
+        q = jnp.where(
+            slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q
+        )
         slip = jnp.where(slips, Slip.SLIPS, slip)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | stick)
@@ -543,13 +652,17 @@ class SlipFlow(FrictionFlow):
         inside, towards = distribute(constant.tangent, b, most, to_check)
         towards = angle_of(pairs(towards))
         # stick is (0, 0), creep begins at r = 0
-        begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
+        begins = jnp.stack(
+            [jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1
+        )
         lost = jnp.where((closed & resting)[:, None], q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)
         checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
         slip = jnp.where(to_check, checked, slip).astype(modes.dtype)
-        modes, pressed = jnp.concatenate([modes[: 2 * m], slip]), to_check & (most > 0)
-        held, begun = pressed & inside, pressed & closed & resting & ~inside
+        modes = jnp.concatenate([modes[: 2 * m], slip])
+        pressed = to_check & (most > 0)
+        held = pressed & inside
+        begun = pressed & closed & resting & ~inside
         return modes, self._stopped(modes, self.with_slip(y, q), lost, held, begun)
 
     def _stopped(
@@ -560,14 +673,19 @@ class SlipFlow(FrictionFlow):
         held: Bool[Array, "m B"],
         begun: Bool[Array, "m B"],
     ) -> Float[Array, "n B"]:
-        """The state after slips `lost`, whose values are 0, have been taken from contacts `held`.
+        """The state after slips `lost`, whose values are 0, have been taken from
+        contacts `held`.
 
-        As in the plane: the tangents of these slips are taken by a tangential impulse; of contacts
-        that have `begun` to slide those across their direction, which friction takes at once.
+        As in the plane: the tangents of these slips are taken by a tangential impulse;
+        of contacts that have `begun` to slide those across their direction, which
+        friction takes at once.
         """
-        m, (x, g, p), q = self.contacts, self.rows(y), self.slip(y)
+        m = self.contacts
+        x, g, p = self.rows(y)
+        q = self.slip(y)
         along, across = polar(jnp.where(begun, q[:, 1], 0.0))
-        frame = jnp.stack([along, across], 2)  # of each contact; the tangents where it sticks
+        # of each contact; the tangents where it sticks
+        frame = jnp.stack([along, across], 2)
         blocks = self.tangent.reshape(m, 2, m, 2, -1)
         blocks = jnp.einsum("iaxB,iajbB,jbyB->ixjyB", frame, blocks, frame)
         rows = flat(jnp.stack([held, held | begun], 1))
@@ -576,11 +694,14 @@ class SlipFlow(FrictionFlow):
         side = flat(jnp.einsum("iaxB,ixB->iaB", frame, pairs(taken)))
         side = side - jax.lax.stop_gradient(side)
         g = g + self.as_rows(modes, times(self.normal_tangent, side))
-        du, (_, slips, creeps) = pairs(times(self.tangent, side)), self.sliding(modes)
+        du = pairs(times(self.tangent, side))
+        _, slips, creeps = self.sliding(modes)
         along, across = polar(jnp.where(slips | creeps, q[:, 1], 0.0))
         r = jnp.where(slips, self.speed(modes, q), 1.0)
         turn = jnp.where(slips, dot(across, du), 0.0)
         polars = jnp.stack([dot(along, du), turn], 1) / r[:, None]
         free = ~self.loaded(modes)
-        q = q + jnp.where((slips | creeps)[:, None], polars, jnp.where(free[:, None], du, 0.0))
+        q = q + jnp.where(
+            (slips | creeps)[:, None], polars, jnp.where(free[:, None], du, 0.0)
+        )
         return jnp.concatenate([x, g, p, flat(q), y[5 * m : 7 * m] + side, y[7 * m :]])

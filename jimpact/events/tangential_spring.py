@@ -6,31 +6,38 @@ With the normal force F of the indentation x a contact j has a spring of stiffne
     holds    xi' = u,  lambda = -k_t xi,                 while |lambda| <= mu F
     slides   xi = mu F / k_t n,  lambda = -mu F n,       while n . (u - xi') >= 0
 
-where n is the direction of xi, and u - xi' is the slip. In the units of `contact_flow.py`, with
+where n is the direction of xi, and u - xi' is the slip. In the units of
+`contact_flow.py`, with
 F = (eta + 1)/2 omega x^eta and xi in those of x, `k_t = kappa eta F / x`: the cone is
 
     kappa eta |xi| <= mu x,
 
-linear in the state. So nothing here is singular or redundant: forces follow from x and xi whatever
-the contacts share, and exact events end the modes. A contact that closes with u and gamma slides at
-once if `kappa eta |u| > mu |gamma|`. The cone closes as x falls to 0: a spring that is still loaded
-then slides. A contact closes with xi = 0.
+linear in the state. So nothing here is singular or redundant: forces follow from x and
+xi whatever the contacts share, and exact events end the modes. A contact that closes
+with u and gamma slides at once if `kappa eta |u| > mu |gamma|`. The cone closes as x
+falls to 0: a spring that is still loaded then slides. A contact closes with xi = 0.
 
-In space n turns while the contact slides: xi' has no component across n but that of u, so
+In space n turns while the contact slides: xi' has no component across n but that of u,
+so
 
-    angle' = A / x sin(phi - angle),   A = kappa eta omega |u| / mu,   phi the angle of u.
+    angle' = A / x sin(phi - angle),   A = kappa eta omega |u| / mu,   phi the angle of
+    u.
 
 This is stiff where x is small. A loaded contact has therefore one of three modes:
 
     HOLDS    xi is a state
-    SLIDES   the angle is a state, and the whole field advances in a time that is shortened by one
+    SLIDES   the angle is a state, and the whole field advances in a time that is
+    shortened by one
              and the sum of the rates A / x
-    DRAGS    A / x is so large that n follows u, behind it by phi' x / (A + x'), exact where phi'
+    DRAGS    A / x is so large that n follows u, behind it by phi' x / (A + x'), exact
+    where phi'
              is steady and x a power of time: a contact that closes while it slides
 
-STATE   x, g, p (m each), u, xi, impulse of lambda (t each), time. In space the rows of xi are 0 and
+STATE   x, g, p (m each), u, xi, impulse of lambda (t each), time. In space the rows of
+xi are 0 and
         the angle while a contact slides.
-MODES   phase, closings, slip (m each): 0 holds; in the plane +-1, the direction in which it slides;
+MODES   phase, closings, slip (m each): 0 holds; in the plane +-1, the direction in
+which it slides;
         in space 1 slides, 2 drags.
 """
 
@@ -63,15 +70,17 @@ from jimpact.numerics.dense import times
 from jimpact.numerics.driver import SLOTS, SLOTS_IN_SPACE
 from jimpact.numerics.stepper import total
 
-# Longest step in the time in which a spring moves by one radian. Errors of a spring without load
-# show in derivatives only: ten times more, and these are wrong.
+# Longest step in the time in which a spring moves by one radian. Errors of a spring
+# without load show in derivatives only: ten times more, and these are wrong.
 RADIAN = 1.0
-# Of the tolerance: a contact that holds slides from this far beyond its cone, where the direction
-# of its spring is known also if it began at rest. Ten times more would be seen in the outcome.
+# Of the tolerance: a contact that holds slides from this far beyond its cone, where the
+# direction of its spring is known also if it began at rest. Ten times more would be
+# seen in the outcome.
 BEYOND = 0.05
-# A contact drags where the rate A / x of its direction is this over the cube root of the tolerance,
-# and slides again from a quarter of that on. Impulses err by its inverse cube times (1 / A)^2. Ten
-# times more: half as many steps again; ten times less: errors of five tolerances.
+# A contact drags where the rate A / x of its direction is this over the cube root of
+# the tolerance, and slides again from a quarter of that on. Impulses err by its inverse
+# cube times (1 / A)^2. Ten times more: half as many steps again; ten times less: errors
+# of five tolerances.
 SWIFT = 10.0
 QUARTER = 0.25
 
@@ -97,7 +106,8 @@ class SpringForces(NamedTuple):
 
     normal: Float[Array, "m B"]  # F
     side: Float[Array, "t B"]  # lambda
-    elongation: Float[Array, "m b B"]  # rates of the rows of xi, in time that is not shortened
+    # rates of the rows of xi, in time that is not shortened
+    elongation: Float[Array, "m b B"]
     direction: Float[Array, "m b B"]  # n of those that slide
     slip: Float[Array, "m B"]  # kappa eta (slip rate along n), of those that slide
     haste: Float[Array, "1 B"]  # >= 1: by how much time is shortened
@@ -119,13 +129,18 @@ class SpringFlow(FrictionFlow):
 
     @property
     def slots(self) -> int:  # type: ignore[override]
-        """Impacts that a CPU computes side by side: in space some take many more passes."""
-        return SLOTS_IN_SPACE if self.in_space else SLOTS
+        """Impacts that a CPU computes side by side: in space some take many more
+        passes.
+        """
+        if self.in_space:
+            return SLOTS_IN_SPACE
+        return SLOTS
 
     @property
     def driving(self) -> tuple[int, ...]:
         """Sizes of the blocks x, g, p, u and xi."""
-        m, t = self.contacts, self.normal_tangent.shape[1]
+        m = self.contacts
+        t = self.normal_tangent.shape[1]
         return m, m, m, t, t
 
     @property
@@ -140,12 +155,21 @@ class SpringFlow(FrictionFlow):
 
     @property
     def longest(self) -> Float[Array, "1 B"]:  # type: ignore[override]
-        """One radian of the fastest spring; in space at most the step that is stable."""
+        """One radian of the fastest spring; in space at most the step that is
+        stable.
+        """
         scale = self.steep * (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
-        rows = jnp.repeat(scale * self.omega, len(self.tangent) // self.contacts, axis=0)
+        rows = jnp.repeat(
+            scale * self.omega, len(self.tangent) // self.contacts, axis=0
+        )
         square = jnp.max(times(jnp.abs(self.tangent), rows), axis=0, keepdims=True)
-        most = STABLE if self.in_space else jnp.inf
-        return jax.lax.stop_gradient(RADIAN / jnp.sqrt(jnp.maximum(square, (RADIAN / most) ** 2)))
+        if self.in_space:
+            most = STABLE
+        else:
+            most = jnp.inf
+        return jax.lax.stop_gradient(
+            RADIAN / jnp.sqrt(jnp.maximum(square, (RADIAN / most) ** 2))
+        )
 
     def by_contact(self, rows: Float[Array, "t B"]) -> Float[Array, "m b B"]:
         """Tangential rows of each contact side by side."""
@@ -153,12 +177,14 @@ class SpringFlow(FrictionFlow):
 
     def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "t B"]:
         """Tangential velocity u."""
-        m, t = self.contacts, self.normal_tangent.shape[1]
+        m = self.contacts
+        t = self.normal_tangent.shape[1]
         return y[3 * m : 3 * m + t]
 
     def spring(self, y: Float[Array, "driving B"]) -> Float[Array, "m b B"]:
         """Rows of xi."""
-        m, t = self.contacts, self.normal_tangent.shape[1]
+        m = self.contacts
+        t = self.normal_tangent.shape[1]
         return self.by_contact(y[3 * m + t : 3 * m + 2 * t])
 
     def elongation(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
@@ -167,9 +193,12 @@ class SpringFlow(FrictionFlow):
         some = square > 0
         return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
 
-    def with_spring(self, y: Float[Array, "n B"], xi: Float[Array, "m b B"]) -> Float[Array, "n B"]:
+    def with_spring(
+        self, y: Float[Array, "n B"], xi: Float[Array, "m b B"]
+    ) -> Float[Array, "n B"]:
         """The state with these rows of xi."""
-        m, t = self.contacts, self.normal_tangent.shape[1]
+        m = self.contacts
+        t = self.normal_tangent.shape[1]
         rows = xi.reshape(t, *xi.shape[2:])
         return jnp.concatenate([y[: 3 * m + t], rows, y[3 * m + 2 * t :]])
 
@@ -189,7 +218,8 @@ class SpringFlow(FrictionFlow):
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "n #B"] | float:
-        """Allowed error of each row, in tolerances; the angle of slip may err by more where x is 0.
+        """Allowed error of each row, in tolerances; the angle of slip may err by more
+        where x is 0.
 
         Its error counts by the force, so that `1 / x` is allowed.
         """
@@ -209,7 +239,9 @@ class SpringFlow(FrictionFlow):
         return SpringConstants(self.normal_constants(modes), loaded, slides)
 
     def aim(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
-        """`A mu = kappa eta omega |u|`: how fast directions turn towards u, times mu x."""
+        """`A mu = kappa eta omega |u|`: how fast directions turn towards u, times mu
+        x.
+        """
         return self.steep * self.omega * length(self.by_contact(self.slip(y)))
 
     def side(
@@ -225,13 +257,17 @@ class SpringFlow(FrictionFlow):
         secant = jnp.where(deep, f / jnp.where(deep, x, 1.0), 0.0)  # F / x
         held = -(self.steep * secant)[:, None] * self.spring(y)
         sliding = -(self.friction * f)[:, None] * n
-        return jnp.where(const.slides[:, None], sliding, held).reshape(self.slip(y).shape)
+        return jnp.where(const.slides[:, None], sliding, held).reshape(
+            self.slip(y).shape
+        )
 
     def slip_acceleration(
         self, f: Float[Array, "m B"], side: Float[Array, "t B"]
     ) -> Float[Array, "t B"]:
         """`u' = K_tn F + K_tt lambda`."""
-        return times(jnp.swapaxes(self.normal_tangent, 0, 1), f) + times(self.tangent, side)
+        return times(jnp.swapaxes(self.normal_tangent, 0, 1), f) + times(
+            self.tangent, side
+        )
 
     def direction(
         self,
@@ -242,8 +278,8 @@ class SpringFlow(FrictionFlow):
     ) -> Float[Array, "m b B"]:
         """Directions n of the springs of contacts that slide.
 
-        In the plane the mode; in space of the angle, or, where it drags, that of u turned back by
-        `phi' x / (A + x')`, phi' = u x u' / |u|^2 by forces along u.
+        In the plane the mode; in space of the angle, or, where it drags, that of u
+        turned back by `phi' x / (A + x')`, phi' = u x u' / |u|^2 by forces along u.
         """
         slip = modes[2 * self.contacts :]
         if not self.in_space:
@@ -254,7 +290,9 @@ class SpringFlow(FrictionFlow):
         speed = length(u)
         moves = drags & (speed > 0)
         size = jnp.where(moves, speed, 1.0)
-        along = jnp.where(moves[:, None], u / size[:, None], jnp.array([1.0, 0.0])[None, :, None])
+        along = jnp.where(
+            moves[:, None], u / size[:, None], jnp.array([1.0, 0.0])[None, :, None]
+        )
         of_angle = towards(jnp.where(slip == Slide.SLIDES, self.spring(y)[:, 1], 0.0))
         first = jnp.where(drags[:, None], along, of_angle)
         rate = self.by_contact(self.slip_acceleration(f, self.side(const, y, f, first)))
@@ -262,19 +300,27 @@ class SpringFlow(FrictionFlow):
         # x' in time: closing g / unit, but 0 where an expansion takes no time
         unit = const.frozen.unit
         lasts = unit > 0
-        sinks = jnp.where(lasts, const.frozen.closing * g / jnp.where(lasts, unit, 1.0), 0.0)
+        sinks = jnp.where(
+            lasts, const.frozen.closing * g / jnp.where(lasts, unit, 1.0), 0.0
+        )
         pace = self.aim(y) + self.friction * sinks
         behind = moves & (pace > 0)
-        lag = jnp.where(behind, self.friction * x * turns / jnp.where(behind, pace, 1.0), 0.0)
+        lag = jnp.where(
+            behind, self.friction * x * turns / jnp.where(behind, pace, 1.0), 0.0
+        )
         return turned((first, perpendicular_to(first)), -lag)[0]
 
     def forces(  # type: ignore[override]
-        self, const: SpringConstants, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+        self,
+        const: SpringConstants,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "driving B"],
     ) -> SpringForces:
         """Forces F and lambda in a state, and the rates of the springs.
 
-        Holding: `xi' = omega u`. Sliding: slip is `n . u - (mu x / (kappa eta))' / omega`, and in
-        space `angle' = A / x (n' . u) / |u|`, n' at right angles to n.
+        Holding: `xi' = omega u`. Sliding: slip is
+        `n . u - (mu x / (kappa eta))' / omega`, and in space
+        `angle' = A / x (n' . u) / |u|`, n' at right angles to n.
         """
         frozen = const.frozen
         x, g, _ = self.rows(y)
@@ -299,11 +345,13 @@ class SpringFlow(FrictionFlow):
     def field(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "n B"]:
-        """Rates of x, g, p, u, xi, its impulse and time, all over `haste`: in shortened time.
+        """Rates of x, g, p, u, xi, its impulse and time, all over `haste`: in shortened
+        time.
 
         Equation: `g' = ratio (G F + K_nt lambda)`, `u' = unit (K_tn F + K_tt lambda)`.
         """
-        frozen, forces = const.frozen, self.forces(const, modes, y)
+        frozen = const.frozen
+        forces = self.forces(const, modes, y)
         side = forces.side
         pull = self.coupling.times(forces.normal) + times(self.normal_tangent, side)
         along = self.slip_acceleration(forces.normal, side)
@@ -317,47 +365,65 @@ class SpringFlow(FrictionFlow):
             frozen.unit,
         ]
         dy = jnp.concatenate(rates)
-        return dy / forces.haste if self.in_space else dy
+        if self.in_space:
+            return dy / forces.haste
+        return dy
 
     def margins(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "k B"]:
-        """Margins of the normal flow; until slip ends; until the spring gives way (m each).
+        """Margins of the normal flow; until slip ends; until the spring gives way (m
+        each).
 
         In space the last ones are also those between sliding and dragging.
 
 
         slip ends   `kappa eta n . u - mu c gamma`-like: the slip rate, see `forces`
         gives way   `mu x - kappa eta |xi|`, and BEYOND of the tolerance
-        drags       `A / x` is below `swift`, or, of one that drags, above a quarter of it
+        drags       `A / x` is below `swift`, or, of one that drags, above a quarter of
+        it
 
         The first two over `mu + kappa eta`; 1 where there is no such end.
         """
-        mu, steep = self.friction, self.steep
+        mu = self.friction
+        steep = self.steep
         x, *_ = self.rows(y)
         slip = self.forces(const, modes, y).slip
         ends = const.slides & (mu > 0)
-        room = (mu * x - steep * self.elongation(y)) / (mu + steep) + BEYOND * self.tolerance
+        room = (mu * x - steep * self.elongation(y)) / (
+            mu + steep
+        ) + BEYOND * self.tolerance
         room = jnp.where(const.loaded & ~const.slides, room, 1.0)
         if self.in_space:
             rubs = jnp.where(mu > 0, mu, 1.0)
             least = self.aim(y) / (self.swift * rubs)  # x below which it drags
             drags = modes[2 * self.contacts :] == Slide.DRAGS
-            room = jnp.where(ends, jnp.where(drags, least / QUARTER - x, x - least), room)
+            room = jnp.where(
+                ends, jnp.where(drags, least / QUARTER - x, x - least), room
+            )
         normal = self.normal_margins(const.frozen, modes, y)
-        return jnp.concatenate([normal, jnp.where(ends, slip / (mu + steep), 1.0), room])
+        return jnp.concatenate(
+            [normal, jnp.where(ends, slip / (mu + steep), 1.0), room]
+        )
 
     def switch(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state after events: slip that ends, springs that give way, openings, closings.
+        """Modes and state after events: slip that ends, springs that give way,
+        openings, closings.
 
-        Slip ends with the spring on its cone, xi = mu x / (kappa eta) n; a contact that opens has
-        xi = 0.
+        Slip ends with the spring on its cone, xi = mu x / (kappa eta) n; a contact that
+        opens has xi = 0.
         """
         m = self.contacts
-        stopped, ended = which[2 * m : 3 * m], which[3 * m :]
-        const, xi, slip = self.constants(modes), self.spring(y), modes[2 * m :]
+        stopped = which[2 * m : 3 * m]
+        ended = which[3 * m :]
+        const = self.constants(modes)
+        xi = self.spring(y)
+        slip = modes[2 * m :]
         n = self.forces(const, modes, y).direction
         ends_slide = const.slides & ended  # in space: it drags from now on, or no more
         direction = jnp.where(const.slides[:, None], n, xi)
@@ -371,7 +437,9 @@ class SpringFlow(FrictionFlow):
         slip = jnp.where(remains, slip, 0)
         xi = jnp.where(remains[:, None], xi, 0.0)
         after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
-        return self.closed(after, self.with_spring(y, xi), remains & ~self.loaded(modes))
+        return self.closed(
+            after, self.with_spring(y, xi), remains & ~self.loaded(modes)
+        )
 
     def sliding_from(
         self,
@@ -381,9 +449,13 @@ class SpringFlow(FrictionFlow):
         slip: Int[Array, "m B"],
         xi: Float[Array, "m b B"],
     ) -> tuple[Float[Array, "m b B"], Int[Array, "m B"]]:
-        """Rows of xi and modes of slip where the contacts `which` slide in these directions."""
+        """Rows of xi and modes of slip where the contacts `which` slide in these
+        directions.
+        """
         if not self.in_space:
-            return xi, jnp.where(which, jnp.sign(direction[:, 0]).astype(slip.dtype), slip)
+            return xi, jnp.where(
+                which, jnp.sign(direction[:, 0]).astype(slip.dtype), slip
+            )
         angle = angle_of(jnp.where(which[:, None], direction, 0.0))
         rows = jnp.stack([jnp.zeros_like(angle), angle], 1)
         swift = self.aim(y) > 2 * QUARTER * self.swift * self.friction * self.rows(y)[0]
@@ -391,9 +463,13 @@ class SpringFlow(FrictionFlow):
         return jnp.where(which[:, None], rows, xi), jnp.where(which, mode, slip)
 
     def closed(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "m B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "m B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state where the contacts `which` have closed: they hold, or slide at once.
+        """Modes and state where the contacts `which` have closed: they hold, or slide
+        at once.
 
         At x = 0 the cone widens at the rate mu |gamma|, the spring at kappa eta |u|.
         """
@@ -407,14 +483,17 @@ class SpringFlow(FrictionFlow):
         modes = jnp.concatenate([modes[: 2 * m], slip.astype(modes.dtype)])
         return modes, self.with_spring(y, xi)
 
-    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
+    def contact_states(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> ContactStates:
         """Forces, velocities, slip and energies of the springs in a state."""
         const = self.constants(modes)
         forces = self.forces(const, modes, y)
         states = ContactFlow.contact_states(self, modes, y)
         t = self.normal_tangent.shape[1]
         square = jnp.sum(self.by_contact(forces.side) ** 2, axis=1)
-        # twice the energy, omega k_t xi^2 over omega^2: lambda^2 x / (kappa eta omega F)
+        # twice the energy, omega k_t xi^2 over omega^2: lambda^2 x / (kappa eta omega
+        # F)
         stiffness = self.steep * self.omega * forces.normal
         some = stiffness > 0
         depth = jnp.maximum(self.rows(y)[0], 0.0)
@@ -434,6 +513,8 @@ class SpringFlow(FrictionFlow):
         """False: no impact with a spring is in closed form."""
         return False
 
-    def wedged(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> Bool[Array, "m B"]:
+    def wedged(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Bool[Array, "m B"]:
         """None: the limit of wedged contacts is that of rigid ones."""
         return jnp.zeros_like(y[: self.contacts], bool)

@@ -1,7 +1,8 @@
-"""Bias of fitted parameters where the law bends within the errors of the velocities before.
+"""Bias of fitted parameters where the law bends within the errors of the velocities
+before.
 
-True v- are found by a law that is linearized at them (`errors_before`). Where it is curved, or has
-a kink, residuals have a mean that is not 0, and parameters follow it.
+True v- are found by a law that is linearized at them (`errors_before`). Where it is
+curved, or has a kink, residuals have a mean that is not 0, and parameters follow it.
 """
 
 from collections.abc import Iterator
@@ -16,8 +17,8 @@ from jimpact.fits.problem import FitProblem
 from jimpact.fits.solve import AnyArray
 from jimpact.tools.compiling import quick_jit
 
-# Bias from which on the report names it, in standard errors: an interval of 95 % then holds the
-# truth in 94 % of sets. Ten times more: in 15 %.
+# Bias from which on the report names it, in standard errors: an interval of 95 % then
+# holds the truth in 94 % of sets. Ten times more: in 15 %.
 WORTH_NAMING = 0.3
 
 
@@ -33,10 +34,12 @@ def _predicted(
 def mean_of_residuals(judged: Judged) -> Float[np.ndarray, "K n"]:
     """The mean that residuals have by the curvature of the law, to second order.
 
-    Equation: `-1/2 sum_i (f(a + s_i) - 2 f(a) + f(a - s_i))`, where `V = sum_i s_i s_i^T` is the
-    covariance of the true v- of a shot, a. Where the law fails beside a, the mean is 0.
+    Equation: `-1/2 sum_i (f(a + s_i) - 2 f(a) + f(a - s_i))`, where `V = sum_i s_i
+    s_i^T` is the covariance of the true v- of a shot, a. Where the law fails beside a,
+    the mean is 0.
     """
-    problem, solution = judged.problem, judged.solution
+    problem = judged.problem
+    solution = judged.solution
     assert problem.before is not None
     assert solution.pre is not None
     assert solution.slopes is not None
@@ -69,7 +72,9 @@ def bias(judged: Judged) -> Float[np.ndarray, " P"]:
 
 
 def bent_within_errors(judged: Judged) -> Iterator[Finding]:
-    """Yield `bent` where the law bends within the errors of v-, so that parameters are biased."""
+    """Yield `bent` where the law bends within the errors of v-, so that parameters are
+    biased.
+    """
     if judged.problem.before is None or judged.solution.pre is None:
         return
     size = bias(judged)
@@ -81,8 +86,10 @@ def bent_within_errors(judged: Judged) -> Iterator[Finding]:
     if parts:
         yield Finding(
             "bent",
-            f"The law bends within the errors of v-, which moves {', '.join(parts)}: measure v- "
-            "better, or state `sigma_pre` = 0 where they are exact, as of bodies at rest.",
+            f"The law bends within the errors of v-, which moves {', '.join(parts)}: "
+            f"measure v- "
+            "better, or state `sigma_pre` = 0 where they are exact, as of bodies at "
+            "rest.",
             "the law bends within the errors of v-",
             numbers={names[i]: float(size[i]) for i in np.flatnonzero(worth)},
         )

@@ -1,9 +1,10 @@
-"""How well data are fitted with some parameters fixed: profiles, from the minima outwards.
+"""How well data are fitted with some parameters fixed: profiles, from the minima
+outwards.
 
-A standard error is half the width of a parabola. Where the sum of squares is not a parabola (at a
-bound, in a flat valley, with several minima), the profile gives the interval: one-sided, or of
-several pieces. Profiles and contours are one search: a grid of fixed values, on a line or in a
-plane, is filled from the minima outwards.
+A standard error is half the width of a parabola. Where the sum of squares is not a
+parabola (at a bound, in a flat valley, with several minima), the profile gives the
+interval: one-sided, or of several pieces. Profiles and contours are one search: a grid
+of fixed values, on a line or in a plane, is filled from the minima outwards.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,26 +18,40 @@ from jimpact.fits.estimate import Estimate
 from jimpact.fits.findings import Finding
 from jimpact.fits.intervals import Profile
 from jimpact.fits.parameters import unscaled
-from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution_of
+from jimpact.fits.search import (
+    SAME_VALUE,
+    START_SCALES,
+    FitMinimum,
+    find_minima,
+    solution_of,
+)
 from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize
 from jimpact.tools.progress import Show, progress_bar
 
-# Deviances are right to this (see `solve.FINE`): the ends of an interval move by less than END. A
-# search that goes on after so many passes creeps along a kink. It begins near its end.
-_STOP, PASSES, NEAR = 1e-4, 16, 1e-6
-# Values beside a minimum: the first raises the root of the deviance of a parabola by STEP of the
-# limit's, each further one is GROWTH times as far from its neighbour.
-STEP, GROWTH = 0.4, 1.5
-FIRST_SHARE = 1 / 16  # of what can be reached: the first value where the error is infinite
-# Share of the root of the limit, or of the values inside, to which an end is searched for.
+# Deviances are right to this (see `solve.FINE`): the ends of an interval move by less
+# than END. A search that goes on after so many passes creeps along a kink. It begins
+# near its end.
+_STOP = 1e-4
+PASSES = 16
+NEAR = 1e-6
+# Values beside a minimum: the first raises the root of the deviance of a parabola by
+# STEP of the limit's, each further one is GROWTH times as far from its neighbour.
+STEP = 0.4
+GROWTH = 1.5
+# of what can be reached: the first value where the error is infinite
+FIRST_SHARE = 1 / 16
+# Share of the root of the limit, or of the values inside, to which an end is searched
+# for.
 END = 1e-3
-ROUNDS = 8  # of the search for an end: it is then right to a millionth of a step, mostly
+# of the search for an end: it is then right to a millionth of a step, mostly
+ROUNDS = 8
 PROFILE_STARTS = 17  # by default, of a search for more minima
 _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
 
 class Lowest(NamedTuple):
-    """A minimum with some parameters fixed: |r|^2, at y, and the start that it descends from.
+    """A minimum with some parameters fixed: |r|^2, at y, and the start that it descends
+    from.
 
     `branch` is the index of that start, `_FROM_BEST` of the best minimum.
     """
@@ -64,47 +79,64 @@ class Grid(NamedTuple):
 
     def nearest(self, y: Float[np.ndarray, " Q"]) -> Index:
         """The cell nearest to y."""
-        return tuple(int(np.abs(v - y[i]).argmin()) for i, v in zip(self.which, self.values))
+        return tuple(
+            int(np.abs(v - y[i]).argmin()) for i, v in zip(self.which, self.values)
+        )
 
     def neighbours(self, cell: Index) -> list[Index]:
         """Cells adjacent to one, diagonal ones too."""
-        axes = [range(max(k - 1, 0), min(k + 2, len(v))) for k, v in zip(cell, self.values)]
+        axes = [
+            range(max(k - 1, 0), min(k + 2, len(v))) for k, v in zip(cell, self.values)
+        ]
         return [near for near in product(*axes) if near != cell]
 
 
 class Deviances:
-    """Deviances `D = (S - S_best) / s^2` of a fit, S = |r|^2 at its least with parameters fixed.
+    """Deviances `D = (S - S_best) / s^2` of a fit, S = |r|^2 at its least with
+    parameters fixed.
 
     Attributes:
         limit: deviance at the end of the interval, or of the region.
-        same: relative difference up to which sums of squares are equal: what impacts are good to.
-            Ten times less: profiles find lower minima in rounding.
+        same: relative difference up to which sums of squares are equal: what impacts
+            are good to. Ten times less: profiles find lower minima in rounding.
         variance: s^2 of the noise.
         error: (P,) standard errors in the solver's scale.
         starts: minima that searches start from, the best one first.
-        best: the best of the minima known before; `lowest`: of all that have been computed.
+        best: the best of the minima known before; `lowest`: of all that have been
+            computed.
         in_a_valley: True where the Jacobian at the best minimum has not full rank.
     """
 
     def __init__(self, fit: Estimate[Any], limit: float, show: Show):
-        """Start from the minima of the fit; `limit` is a deviance, `show` displays progress."""
-        self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
+        """Start from the minima of the fit; `limit` is a deviance, `show` displays
+        progress.
+        """
+        self.fit = fit
+        self.problem = fit.problem
+        self.limit = limit
+        self.show = show
         self.same = RANK_TOLERANCE[self.problem.precision]
         has_noise = np.isfinite(fit.noise) and fit.noise > 0
         # of an exact fit: that of rounding
-        self.variance = float(fit.noise**2) if has_noise else self.problem.exact_squares
+        if has_noise:
+            self.variance = float(fit.noise**2)
+        else:
+            self.variance = self.problem.exact_squares
         self.error = fit.standard_error / self.problem.steps_at(fit.value)
         self.starts: list[Lowest] = []
         self.in_a_valley = fit.rank < len(fit.names)
         self.add_starts(fit.starts)
 
     def add_starts(self, minima: Sequence[FitMinimum]) -> None:
-        """Add minima to `starts`, and keep the best one and all others within the limit.
+        """Add minima to `starts`, and keep the best one and all others within the
+        limit.
 
-        Of minima that differ by less than `SAME_VALUE` one is kept; in a valley, the best one only.
+        Of minima that differ by less than `SAME_VALUE` one is kept; in a valley, the
+        best one only.
         """
         new = [
-            Lowest(end.sum_of_squares, self.problem.variables.point(end.value)) for end in minima
+            Lowest(end.sum_of_squares, self.problem.variables.point(end.value))
+            for end in minima
         ]
         starts = [*self.starts, *new]
         self.best, least = starts[0], RANK_TOLERANCE[self.problem.precision]
@@ -112,30 +144,45 @@ class Deviances:
             if self._is_below(start.squares, self.best.squares):
                 rank = np.linalg.matrix_rank(end.jacobian, rtol=least)
                 self.best, self.in_a_valley = start, rank < len(self.fit.names)
-        self.lowest, self.starts = self.best, []
+        self.lowest = self.best
+        self.starts = []
         for start in (self.best, *starts):
-            apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
+            apart = all(
+                np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts
+            )
             if apart and self.of(start.squares) <= self.limit:
                 self.starts.append(start)
         if self.in_a_valley:  # the others are points of the same valley
             self.starts = [self.best]
 
     def minimize(
-        self, trials: Sequence[tuple[tuple[int, ...], Sequence[float], Float[np.ndarray, " Q"]]]
+        self,
+        trials: Sequence[
+            tuple[tuple[int, ...], Sequence[float], Float[np.ndarray, " Q"]]
+        ],
     ) -> Ends:
-        """Least squares over the parameters that are not fixed, all trials side by side.
+        """Least squares over the parameters that are not fixed, all trials side by
+        side.
 
-        A trial holds the indices of the fixed parameters, their values (scaled), and the start y.
-        `lowest` is updated.
+        A trial holds the indices of the fixed parameters, their values (scaled), and
+        the start y. `lowest` is updated.
         """
         points = np.array([y for _, _, y in trials])
         # of the Q entries of y the first P are parameters, and the others stay
-        fixed = np.tile(np.arange(points.shape[1]) >= len(self.fit.names), (len(points), 1))
+        fixed = np.tile(
+            np.arange(points.shape[1]) >= len(self.fit.names), (len(points), 1)
+        )
         for k, (which, values, _) in enumerate(trials):
-            points[k, which], fixed[k, which] = values, True
+            points[k, which] = values
+            fixed[k, which] = True
         solver = Solver(max_steps=PASSES, show=self.show, damping=NEAR)
         ends = minimize(
-            [self.problem.least_squares()], points, solver, _STOP, what="fixed values", fixed=fixed
+            [self.problem.least_squares()],
+            points,
+            solver,
+            _STOP,
+            what="fixed values",
+            fixed=fixed,
         )
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
@@ -153,25 +200,33 @@ class Deviances:
     def values(self, i: int, y: Any) -> Any:
         """Values x_i of the i-th parameter from scaled values y_i."""
         return unscaled(
-            y, float(self.problem.variables.scale[i]), bool(self.problem.variables.log[i])
+            y,
+            float(self.problem.variables.scale[i]),
+            bool(self.problem.variables.log[i]),
         )
 
     def reach(self, i: int) -> tuple[float, float]:
-        """Scaled bounds of the i-th parameter; in the place of infinite ones, y_i -+ START_SCALES.
+        """Scaled bounds of the i-th parameter; in the place of infinite ones, y_i -+
+        START_SCALES.
 
         y_i is that of the best minimum.
         """
-        variables, best = self.problem.variables, self.best.y[i]
-        low, high = variables.low[i], variables.high[i]
-        low = low if np.isfinite(low) else best - START_SCALES
+        variables = self.problem.variables
+        best = self.best.y[i]
+        low = variables.low[i]
+        high = variables.high[i]
+        if not np.isfinite(low):
+            low = best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
     def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Lowest]]:
-        """Minima by cell, for each grid: a flood fill from `starts` until deviances pass the limit.
+        """Minima by cell, for each grid: a flood fill from `starts` until deviances
+        pass the limit.
 
-        Each cell below the limit starts its neighbours from its own minimum, also those that were
-        reached from another start. One above may lie on a ridge: it is repeated from the best
-        minimum. A sweep computes all waiting cells of all grids side by side.
+        Each cell below the limit starts its neighbours from its own minimum, also those
+        that were reached from another start. One above may lie on a ridge: it is
+        repeated from the best minimum. A sweep computes all waiting cells of all grids
+        side by side.
         """
         minima: list[dict[Index, Lowest]] = [{} for _ in grids]
         # y to start from, by index of the grid, cell, and index of the start (branch)
@@ -182,12 +237,21 @@ class Deviances:
         }
         while waiting:
             ends = self.minimize(
-                [(grids[g].which, grids[g].at(cell), y) for (g, cell, _), y in waiting.items()]
+                [
+                    (grids[g].which, grids[g].at(cell), y)
+                    for (g, cell, _), y in waiting.items()
+                ]
             )
-            trials, waiting = list(waiting), {}
-            for (g, cell, branch), squares, y in zip(trials, ends.squares.tolist(), ends.y):
+            trials = list(waiting)
+            waiting = {}
+            for (g, cell, branch), squares, y in zip(
+                trials, ends.squares.tolist(), ends.y
+            ):
                 cells = minima[g]
-                if cell in cells and not squares < (1 - self.same) * cells[cell].squares:
+                if (
+                    cell in cells
+                    and not squares < (1 - self.same) * cells[cell].squares
+                ):
                     continue  # not lower than from another start
                 cells[cell] = Lowest(squares, y, branch)
                 if self.of(squares) > self.limit:  # no further in this direction
@@ -201,21 +265,29 @@ class Deviances:
 
 
 def profiles_of(
-    fit: Estimate[Any], which: Sequence[int], level: float, points: int, progress: float | None
+    fit: Estimate[Any],
+    which: Sequence[int],
+    level: float,
+    points: int,
+    progress: float | None,
 ) -> tuple[Profile, ...]:
-    """Profiles of the parameters of these indices, repeated where they find a lower minimum.
+    """Profiles of the parameters of these indices, repeated where they find a lower
+    minimum.
 
     Args:
         fit: by least squares.
         which: indices of parameters.
         level: of the confidence intervals.
-        points: number of starts of a search for more minima, after a fit from one start.
+        points: number of starts of a search for more minima, after a fit from one
+            start.
         progress: bar on stderr; None: on a terminal.
     """
     with progress_bar(progress) as show:
         lines = Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(find_minima(fit.problem, points, fit.seed, Solver(show=show)).starts)
+            lines.add_starts(
+                find_minima(fit.problem, points, fit.seed, Solver(show=show)).starts
+            )
         for _ in range(ROUNDS):
             profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:
@@ -226,7 +298,8 @@ def profiles_of(
 
 
 class _Crossing(NamedTuple):
-    """Two neighbouring fixed values (scaled), one below the limit of the deviance, one above.
+    """Two neighbouring fixed values (scaled), one below the limit of the deviance, one
+    above.
 
     `below` and `above` are `sqrt(D / limit) - 1` there.
     """
@@ -238,32 +311,40 @@ class _Crossing(NamedTuple):
 
 
 class Lines(Deviances):
-    """Profiles: deviances over the values of one parameter, and where they pass the limit."""
+    """Profiles: deviances over the values of one parameter, and where they pass the
+    limit.
+    """
 
     def grid(self, i: int) -> Grid:
-        """Fixed values of the i-th parameter, scaled: its bounds, and around the minima.
+        """Fixed values of the i-th parameter, scaled: its bounds, and around the
+        minima.
 
-        Equation: at distances `d (a^k - 1) / (a - 1)`, k = 1, 2, .., to both sides of each start,
-        with a = `GROWTH`, `d = STEP sqrt(limit) error`, as far as no other start is nearer.
+        Equation: at distances `d (a^k - 1) / (a - 1)`, k = 1, 2, .., to both sides of
+        each start, with a = `GROWTH`, `d = STEP sqrt(limit) error`, as far as no other
+        start is nearer.
         """
         low, high = self.reach(i)
         centres = np.array([start.y[i] for start in self.starts])
-        first, widest = STEP * np.sqrt(self.limit) * self.error[i], FIRST_SHARE * (high - low)
+        first = STEP * np.sqrt(self.limit) * self.error[i]
+        widest = FIRST_SHARE * (high - low)
         if not 0 < first < widest:
             first = widest
         count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
         away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
         near = centres[:, None] + np.concatenate([-away, away])  # a row for each start
         owner = np.abs(near[..., None] - centres).argmin(axis=-1)  # the nearest start
-        near = near[(owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)]
+        near = near[
+            (owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)
+        ]
         return Grid((i,), (np.unique([*centres, low, high, *near]),))
 
     def profiles(self, which: Sequence[int], level: float) -> tuple[Profile, ...]:
         """Profiles of the parameters of these indices.
 
-        The values at which the deviance D passes the limit are found by regula falsi on `sqrt(D /
-        limit) - 1` (every third step by bisection), all ends side by side. Each value is solved
-        from the minima of both neighbours, as minima may change places between them.
+        The values at which the deviance D passes the limit are found by regula falsi on
+        `sqrt(D / limit) - 1` (every third step by bisection), all ends side by side.
+        Each value is solved from the minima of both neighbours, as minima may change
+        places between them.
         """
         grids = [self.grid(i) for i in which]
         lines = [
@@ -274,8 +355,12 @@ class Lines(Deviances):
             trials = []  # index of the line, fixed value, start y
             for n, line in enumerate(lines):
                 for inside, outside, below, above in self._crossings(line):
-                    falsi = np.clip(below / (below - above), 0.02, 0.98)  # not at the ends
-                    share = falsi if turn % 3 < 2 else 0.5
+                    # not at the ends
+                    falsi = np.clip(below / (below - above), 0.02, 0.98)
+                    if turn % 3 < 2:
+                        share = falsi
+                    else:
+                        share = 0.5
                     value = float(inside + share * (outside - inside))
                     trials += [(n, value, line[end].y) for end in (inside, outside)]
             if not trials:
@@ -283,19 +368,29 @@ class Lines(Deviances):
             ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
             for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 end = Lowest(squares, y)
-                lines[n][value] = min(lines[n].get(value, end), end, key=lambda e: e.squares)
+                lines[n][value] = min(
+                    lines[n].get(value, end), end, key=lambda e: e.squares
+                )
         return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
     def _crossings(self, line: dict[float, Lowest]) -> Iterator[_Crossing]:
-        """Neighbouring values between which the deviance passes the limit, if not near enough yet.
+        """Neighbouring values between which the deviance passes the limit, if not near
+        enough yet.
 
-        Near enough: `sqrt(D / limit) - 1` is within `END` at one of them, or they are close.
+        Near enough: `sqrt(D / limit) - 1` is within `END` at one of them, or they are
+        close.
         """
         values, deviance = self.deviance(line)
-        height, inside = np.sqrt(deviance / self.limit) - 1, values[deviance <= self.limit]
+        height = np.sqrt(deviance / self.limit) - 1
+        inside = values[deviance <= self.limit]
         least = END * max(np.ptp(inside), END * abs(inside[0]))
         for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
-            a, b = (k, k + 1) if height[k] <= 0 else (k + 1, k)
+            if height[k] <= 0:
+                a = k
+                b = k + 1
+            else:
+                a = k + 1
+                b = k
             if min(-height[a], height[b]) > END and abs(values[b] - values[a]) > least:
                 yield _Crossing(values[a], values[b], height[a], height[b])
 
@@ -309,7 +404,8 @@ class Lines(Deviances):
     def profile(self, i: int, line: dict[float, Lowest], level: float) -> Profile:
         """The profile of parameter i from the minima at its fixed values, `line`.
 
-        Each run of neighbouring values below the limit is a piece of the confidence interval.
+        Each run of neighbouring values below the limit is a piece of the confidence
+        interval.
         """
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
@@ -322,7 +418,9 @@ class Lines(Deviances):
             )
             for piece in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         )
-        is_of_fit = np.array_equal(self.best.y, self.problem.variables.point(self.fit.value))
+        is_of_fit = np.array_equal(
+            self.best.y, self.problem.variables.point(self.fit.value)
+        )
         return Profile(
             name=self.fit.names[i],
             value=self.values(i, y),
@@ -342,7 +440,8 @@ class Lines(Deviances):
         k: int,
         step: int,
     ) -> float:
-        """End of an interval: where the deviance D passes the limit, or the end of the domain.
+        """End of an interval: where the deviance D passes the limit, or the end of the
+        domain.
 
         By linear interpolation of sqrt(D) between the values k and k + step.
 
@@ -356,14 +455,22 @@ class Lines(Deviances):
         beyond = k + step
         if not 0 <= beyond < len(y):
             return float(self.problem.domains[i][(step + 1) // 2])
-        root, root_beyond = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
+        root = np.sqrt(deviance[k])
+        root_beyond = np.sqrt(deviance[beyond])
         share = (np.sqrt(self.limit) - root) / (root_beyond - root)
         return float(self.values(i, y[k] + share * (y[beyond] - y[k])))
 
 
-def lower_minimum(names: tuple[str, ...], profiles: Sequence[Profile]) -> Iterator[Finding]:
-    """Yield `lower_minimum` where profiles have found a minimum below that of the fit."""
+def lower_minimum(
+    names: tuple[str, ...], profiles: Sequence[Profile]
+) -> Iterator[Finding]:
+    """Yield `lower_minimum` where profiles have found a minimum below that of the
+    fit.
+    """
     if profiles and (better := profiles[0].better) is not None:
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(names, better))
-        line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
+        line = (
+            f"A profile found a lower minimum than the fit ({values}): allow more "
+            f"`starts`."
+        )
         yield Finding("lower_minimum", line, "a profile found a lower minimum")

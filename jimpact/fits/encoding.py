@@ -31,10 +31,12 @@ from jimpact.numerics.sparse import Neighbours
 _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 # of values in the file that are not arrays, mappings or classes with fields
 _KINDS: dict[str, Any] = {
-    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, np.float64, tuple, list)
+    kind.__name__: kind
+    for kind in (StaticNumber, StaticNumbers, float, np.float64, tuple, list)
 } | {"Prior": Prior._make}
-# Fields that files of earlier builds may lack. Their fits with errors of v- hold these errors as
-# they were passed on, which `before` = None keeps: profiles belong to what was minimized then.
+# Fields that files of earlier builds may lack. Their fits with errors of v- hold these
+# errors as they were passed on, which `before` = None keeps: profiles belong to what
+# was minimized then.
 _LATER = {"covariance", "curve", "pre", "before", "tangential_stiffness"}
 # classes of a fit that have no public name, by their own
 _PARTS = {
@@ -70,31 +72,43 @@ def encoded(value: Any) -> Any:
         return value
     if isinstance(value, float):
         plain = type(value) is float and np.isfinite(value)
-        return value if plain else {type(value).__name__: repr(float(value))}
+        if plain:
+            return value
+        return {type(value).__name__: repr(float(value))}
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
         entries = [encoded(x) for x in array.ravel().tolist()]
         kind = {"dtype": str(array.dtype), "device": isinstance(value, jax.Array)}
         return {"array": entries, "shape": list(array.shape), **kind}
     if dataclasses.is_dataclass(value):
-        fields = {name: encoded(getattr(value, name)) for name in _saved_fields(type(value))}
+        fields = {
+            name: encoded(getattr(value, name)) for name in _saved_fields(type(value))
+        }
         return {"class": _name_of(type(value)), "fields": fields}
     if isinstance(value, Mapping):
         return {"dict": {key: encoded(each) for key, each in value.items()}}
     if isinstance(value, list | tuple):
         return {type(value).__name__: [encoded(each) for each in value]}
-    raise ValueError(f"Argument `fit` must hold numbers and words to be saved, but has {value!r}.")
+    raise ValueError(
+        f"Argument `fit` must hold numbers and words to be saved, but has {value!r}."
+    )
 
 
 def decoded(data: Any) -> Any:
-    """The value of data that `encoded` has made: a dictionary names the kind of its content."""
+    """The value of data that `encoded` has made: a dictionary names the kind of its
+    content.
+    """
     if not isinstance(data, dict):
         return data
     if "class" in data:
         return instance_of(_class_of(data["class"]), data["fields"])
     if "array" in data:
-        array = np.array([decoded(x) for x in data["array"]], data["dtype"]).reshape(data["shape"])
-        return jnp.asarray(array) if data["device"] else array
+        array = np.array([decoded(x) for x in data["array"]], data["dtype"]).reshape(
+            data["shape"]
+        )
+        if data["device"]:
+            return jnp.asarray(array)
+        return array
     ((kind, content),) = data.items()
     if kind == "dict":
         return {key: decoded(each) for key, each in content.items()}
@@ -102,17 +116,22 @@ def decoded(data: Any) -> Any:
 
 
 def _name_of(cls: type) -> str:
-    """`ji.LZB` of a public class, its own name of a part of a fit, else module and name."""
+    """`ji.LZB` of a public class, its own name of a part of a fit, else module and
+    name.
+    """
     name = cls.__qualname__
     if name in dir(jimpact) and getattr(jimpact, name) is cls:
         return f"ji.{name}"
-    return name if _PARTS.get(name) is cls else f"{cls.__module__}:{name}"
+    if _PARTS.get(name) is cls:
+        return name
+    return f"{cls.__module__}:{name}"
 
 
 def _class_of(place: str) -> Any:
     """The class of a name that `_name_of` gave: 'ji.LZB', 'Solution' or 'module:Name'.
 
-    Names of jimpact's own modules, as builds before 0.2 gave them, count without the module.
+    Names of jimpact's own modules, as builds before 0.2 gave them, count without the
+    module.
     """
     module, _, name = place.rpartition(":")
     if module and module.partition(".")[0] != "jimpact":
@@ -127,15 +146,21 @@ def _class_of(place: str) -> Any:
 
 def _saved_fields(cls: Any) -> list[str]:
     """Names of the fields of a class that a file holds."""
-    return [field.name for field in dataclasses.fields(cls) if field.metadata.get("saved", True)]
+    return [
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.metadata.get("saved", True)
+    ]
 
 
 def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Encoded fields, with those that belong to a class in `parts` moved into a field of that name.
+    """Encoded fields, with those that belong to a class in `parts` moved into a field
+    of that name.
 
     Older files hold all of them side by side.
     """
-    others, groups = dict(fields), {}
+    others = dict(fields)
+    groups = {}
     for name, part in parts.items():
         of_part = {key: others.pop(key) for key in _saved_fields(part) if key in others}
         groups[name] = {"class": part.__name__, "fields": of_part}
@@ -143,7 +168,8 @@ def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
-    """An instance of a dataclass with these encoded fields; a TypeError unless it has just these.
+    """An instance of a dataclass with these encoded fields; a TypeError unless it has
+    just these.
 
     Fields of older files get their present names.
     """
@@ -156,8 +182,11 @@ def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
         fields = grouped(fields, {"variables": Variables, "measurement": Measurement})
     if names != set(fields):
         name = getattr(cls, "__name__", cls)
-        raise TypeError(f"{name} has the fields {sorted(names)}, the file {sorted(fields)}")
-    instance: Any = object.__new__(cls)  # as it was: its fields have been checked and converted
+        raise TypeError(
+            f"{name} has the fields {sorted(names)}, the file {sorted(fields)}"
+        )
+    # as it was: its fields have been checked and converted
+    instance: Any = object.__new__(cls)
     for key, value in fields.items():
         object.__setattr__(instance, key, decoded(value))
     return instance

@@ -1,18 +1,20 @@
-"""Errors of the velocities before an impact: the true v- of each shot is a nuisance of the fit.
+"""Errors of the velocities before an impact: the true v- of each shot is a nuisance of
+the fit.
 
-With x and y the measured v- and v+ of a shot, S the covariance of their errors, a its true v- and f
-the law, the misfit is the least over a of `(x - a, y - f(a)) S^-1 (x - a, y - f(a))^T`. Where f is
-linear, with `J = df/da`, the nuisance is projected out:
+With x and y the measured v- and v+ of a shot, S the covariance of their errors, a its
+true v- and f the law, the misfit is the least over a of
+`(x - a, y - f(a)) S^-1 (x - a, y - f(a))^T`. Where f is linear, with `J = df/da`, the
+nuisance is projected out:
 
     r = f(a) + J (x - a) - y,    C = A S A^T,    A = [-J, I],    misfit = r^T C^-1 r,
     a = x + (S A^T C^-1 r)_-,
 
-where ( )_- are the first n entries, those of v-. Else f is linearized at the last a, again and
-again, until a stays; the misfit and its gradient in parameters, `2 r^T C^-1 df/dx` at fixed a, J
-and C, are then exact.
+where ( )_- are the first n entries, those of v-. Else f is linearized at the last a,
+again and again, until a stays; the misfit and its gradient in parameters,
+`2 r^T C^-1 df/dx` at fixed a, J and C, are then exact.
 
-Where momentum was corrected, the projector P keeps what the correction has left of y: r = P r, and
-A = P [-J, I].
+Where momentum was corrected, the projector P keeps what the correction has left of y: r
+= P r, and A = P [-J, I].
 """
 
 from dataclasses import dataclass
@@ -34,12 +36,14 @@ from jimpact.shots.data import Experiments, kept_by_corrections
 class ErrorsBefore:
     """Errors of (v-, v+) of K shots in G groups that are independent of each other.
 
-    A group is a shot, n velocities, or all shots, M = n K: `(v- of its shots, v+ of its shots)`.
+    A group is a shot, n velocities, or all shots, M = n K:
+    `(v- of its shots, v+ of its shots)`.
 
     Attributes:
         covariance: S of each group.
         kept: P of each group.
-        removed: `(I - P) S_++ (I - P)^T` of each group, which makes C invertible where r is 0.
+        removed: `(I - P) S_++ (I - P)^T` of each group, which makes C invertible where
+            r is 0.
     """
 
     covariance: Float[AnyArray, "G 2*M 2*M"]
@@ -62,15 +66,18 @@ class ErrorsBefore:
         removed = lost @ after @ lost.swapaxes(1, 2)
         if joint.ndim == 3:
             return cls(joint, kept, removed)
-        parts = joint.reshape(count, 2, n, count, 2, n)  # (shot, - or +, velocity), twice
-        whole = parts.transpose(1, 0, 2, 4, 3, 5).reshape(1, 2 * n * count, 2 * n * count)
+        # (shot, - or +, velocity), twice
+        parts = joint.reshape(count, 2, n, count, 2, n)
+        whole = parts.transpose(1, 0, 2, 4, 3, 5).reshape(
+            1, 2 * n * count, 2 * n * count
+        )
         return cls(whole, _block_diagonal(kept, 1, np), _block_diagonal(removed, 1, np))
 
     def filled(self, shots: Int[np.ndarray, " F"]) -> "ErrorsBefore":
         """F >= K shots by their indices: all K of them, then copies of the last one.
 
-        In a group of all shots the copies have no errors and no correlations: their values have no
-        weight.
+        In a group of all shots the copies have no errors and no correlations: their
+        values have no weight.
         """
         groups = len(self.covariance)
         count = int(shots[-1]) + 1
@@ -78,14 +85,20 @@ class ErrorsBefore:
         if not copies:
             return self
         if groups == count:
-            return ErrorsBefore(self.covariance[shots], self.kept[shots], self.removed[shots])
+            return ErrorsBefore(
+                self.covariance[shots], self.kept[shots], self.removed[shots]
+            )
         size = self.kept.shape[-1]
         more = copies * size // count
         halves = self.covariance.reshape(1, 2, size, 2, size)
         wider = ((0, 0), (0, 0), (0, more), (0, 0), (0, more))
-        covariance = np.pad(halves, wider).reshape(1, 2 * (size + more), 2 * (size + more))
+        covariance = np.pad(halves, wider).reshape(
+            1, 2 * (size + more), 2 * (size + more)
+        )
         square = ((0, 0), (0, more), (0, more))
-        return ErrorsBefore(covariance, np.pad(self.kept, square), np.pad(self.removed, square))
+        return ErrorsBefore(
+            covariance, np.pad(self.kept, square), np.pad(self.removed, square)
+        )
 
     def standard_errors(self, shape: tuple[int, ...]) -> Float[AnyArray, "K n"]:
         """Those of v-, in the shape (K, n) of the shots."""
@@ -96,19 +109,25 @@ class ErrorsBefore:
     def drawn(
         self, rng: np.random.Generator, shape: tuple[int, int, int]
     ) -> tuple[Float[np.ndarray, "B K n"], Float[np.ndarray, "B K n"]]:
-        """B sets of normally distributed errors of v- and of v+; `shape` is (B, K, n)."""
+        """B sets of normally distributed errors of v- and of v+; `shape` is (B, K,
+        n).
+        """
         covariance = np.asarray(self.covariance, float)
         variances, directions = np.linalg.eigh(covariance)
         scale = directions * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
         groups, size = covariance.shape[:2]
-        errors = np.einsum("gij,bgj->bgi", scale, rng.normal(size=(shape[0], groups, size)))
+        errors = np.einsum(
+            "gij,bgj->bgi", scale, rng.normal(size=(shape[0], groups, size))
+        )
         before, after = np.split(errors, 2, axis=2)
         return before.reshape(shape), after.reshape(shape)
 
     def corrected(
         self, pre: Float[np.ndarray, "B K n"], post: Float[np.ndarray, "B K n"]
     ) -> Float[np.ndarray, "B K n"]:
-        """v+ with the momentum of v- where momentum was corrected: `P v+ + (I - P) v-`."""
+        """v+ with the momentum of v- where momentum was corrected:
+        `P v+ + (I - P) v-`.
+        """
         groups, size = self.kept.shape[:2]
         difference = (post - pre).reshape(-1, groups, size)
         kept = np.einsum("gij,bgj->bgi", np.asarray(self.kept, float), difference)
@@ -130,10 +149,16 @@ class ErrorsBefore:
         """C of each shot, or of all; J that are not finite count as the identity."""
         count, n = slope.shape[:2]
         covariance = np.asarray(self.propagated(_finite_slope(slope, np))[1])
-        return covariance.reshape((count, n, n) if len(covariance) == count else (count, n) * 2)
+        return covariance.reshape(
+            (count, n, n) if len(covariance) == count else (count, n) * 2
+        )
 
-    def covariance_of_true(self, slope: Float[np.ndarray, "K n n"]) -> Float[np.ndarray, "K n n"]:
-        """Covariance of the true v- of each shot: `S_-- - (S A^T)_- C^-1 (S A^T)_-^T`."""
+    def covariance_of_true(
+        self, slope: Float[np.ndarray, "K n n"]
+    ) -> Float[np.ndarray, "K n n"]:
+        """Covariance of the true v- of each shot:
+        `S_-- - (S A^T)_- C^-1 (S A^T)_-^T`.
+        """
         count, n = slope.shape[:2]
         gain, covariance = self.propagated(_finite_slope(slope, np))
         size = gain.shape[1]
@@ -142,8 +167,11 @@ class ErrorsBefore:
         left = np.asarray(self.covariance, float)[:, :size, :size] - explained
         return diagonal_blocks(left if len(left) == count else left[0], n)
 
-    def whitener(self, slope: Float[Array, "K n n"], used: Bool[Array, "K n"]) -> "Whitener":
-        """What makes the residuals r of the shots independent of each other, at these J (`slope`).
+    def whitener(
+        self, slope: Float[Array, "K n n"], used: Bool[Array, "K n"]
+    ) -> "Whitener":
+        """What makes the residuals r of the shots independent of each other, at these J
+        (`slope`).
 
         Args:
             slope: J; where it is not finite, the identity.
@@ -156,13 +184,17 @@ class ErrorsBefore:
         identity = jnp.eye(size, dtype=covariance.dtype)[None]
         covariance = jnp.where(takes_part, covariance, identity)
         sigma = jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2))
-        factor = jnp.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
+        factor = jnp.linalg.cholesky(
+            covariance / (sigma[:, :, None] * sigma[:, None, :])
+        )
         cross = (self.covariance[:, :size] @ gain.swapaxes(1, 2)) / sigma[:, None, :]
         return Whitener(sigma, factor, jnp.asarray(cross))
 
 
 class Whitener(NamedTuple):
-    """sigma and F of `C = diag(sigma) F F^T diag(sigma)`, and `(S A^T)_- / sigma`, by groups."""
+    """sigma and F of `C = diag(sigma) F F^T diag(sigma)`, and `(S A^T)_- / sigma`, by
+    groups.
+    """
 
     sigma: Float[Array, "G M"]
     factor: Float[Array, "G M M"]
@@ -179,10 +211,14 @@ class Whitener(NamedTuple):
         force = self._solved(independent, transposed=True)
         return (self.cross @ force[:, :, None])[:, :, 0].reshape(error.shape)
 
-    def _solved(self, right: Float[Array, "G M"], transposed: bool) -> Float[Array, "G M"]:
+    def _solved(
+        self, right: Float[Array, "G M"], transposed: bool
+    ) -> Float[Array, "G M"]:
         """`F^-1 right`, or `F^-T right`."""
         solve = jax.scipy.linalg.solve_triangular
-        return jax.vmap(partial(solve, lower=True, trans=int(transposed)))(self.factor, right)
+        return jax.vmap(partial(solve, lower=True, trans=int(transposed)))(
+            self.factor, right
+        )
 
 
 def _finite_slope(slope: Float[AnyArray, "K n n"], xp: Any) -> Float[AnyArray, "K n n"]:
@@ -194,7 +230,9 @@ def _finite_slope(slope: Float[AnyArray, "K n n"], xp: Any) -> Float[AnyArray, "
 def _block_diagonal(
     blocks: Float[AnyArray, "K n n"], groups: int, xp: Any
 ) -> Float[AnyArray, "G M M"]:
-    """Matrices (M, M) of G groups of K / G shots, with the shots' blocks on their diagonals."""
+    """Matrices (M, M) of G groups of K / G shots, with the shots' blocks on their
+    diagonals.
+    """
     count, n, _ = blocks.shape
     members = count // groups
     grouped = blocks.reshape(groups, members, n, 1, n)

@@ -16,7 +16,8 @@ from jimpact.fits.search import FitMinimum, Solution
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.shots.data import Experiments
 
-# Relative standard error of a stiffness beyond which its linearized interval is not believed.
+# Relative standard error of a stiffness beyond which its linearized interval is not
+# believed.
 HARDLY_SEEN = 0.2
 LEVEL = 0.95  # of confidence intervals, where none is asked for
 
@@ -28,12 +29,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def in_own_precision(function: Function) -> Function:
     """A function of a fit, computed in the precision in which the fit was made.
 
-    JAX's precision may have changed since: what is computed later belongs to the fit all the same.
+    JAX's precision may have changed since: what is computed later belongs to the fit
+    all the same.
     """
 
     @functools.wraps(function)
     def computed(fit: Any, *arguments: Any, **options: Any) -> Any:
-        """The function, of the fit and its other arguments; of no fit in JAX's own precision."""
+        """The function, of the fit and its other arguments; of no fit in JAX's own
+        precision.
+        """
         if not isinstance(fit, Estimate):
             return function(fit, *arguments, **options)
         with jax.enable_x64(fit.problem.precision == "float64"):
@@ -63,7 +67,9 @@ class OfField(Generic[Value]):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate(Generic[AnyLaw]):
-    """P fitted parameters of a law, the minima of the search, and linearized errors; see `Fit`."""
+    """P fitted parameters of a law, the minima of the search, and linearized errors;
+    see `Fit`.
+    """
 
     law: AnyLaw
     method: str
@@ -98,7 +104,9 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def residual(self) -> np.ndarray:
-        """Measured less predicted, shaped like what was measured; NaN where no value was."""
+        """Measured less predicted, shaped like what was measured; NaN where no value
+        was.
+        """
         return np.asarray(self.problem.measured, float) - self.predicted
 
     @property
@@ -113,7 +121,9 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def shot_count(self) -> int:
-        """Shots (or rows of what was measured) with at least one value that was used."""
+        """Shots (or rows of what was measured) with at least one value that was
+        used.
+        """
         measured = np.isfinite(self.problem.measured)
         return int(measured.any(axis=tuple(range(1, measured.ndim))).sum())
 
@@ -124,17 +134,23 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def chi_squared(self) -> float:
-        """The sum of squared residuals in units of sigma, those of priors included; NaN where sigma
-        is unknown."""
-        return np.nan if self.problem.sigma is None else self.starts[0].sum_of_squares
+        """The sum of squared residuals in units of sigma, those of priors included; NaN
+        where sigma is unknown.
+        """
+        if self.problem.sigma is None:
+            return np.nan
+        return self.starts[0].sum_of_squares
 
     @property
     def aic(self) -> float:
-        """Akaike's information criterion of a fit by least squares; else, and of exact data, NaN.
+        """Akaike's information criterion of a fit by least squares; else, and of exact
+        data, NaN.
 
-        Equation: `chi^2 + 2 P`; where sigma is unknown `n log(|r|^2 / n) + 2 (P + 1)`, n values.
+        Equation: `chi^2 + 2 P`; where sigma is unknown `n log(|r|^2 / n) + 2 (P + 1)`,
+        n values.
         """
-        squares, values = self.starts[0].sum_of_squares, self.problem.values
+        squares = self.starts[0].sum_of_squares
+        values = self.problem.values
         if self.loss != "squares":
             return np.nan
         if self.problem.sigma is not None:
@@ -146,22 +162,27 @@ class Estimate(Generic[AnyLaw]):
     def quantile(self, level: float) -> float:
         """Half-width of a confidence interval of this `level`, in standard errors.
 
-        The quantile at `(1 + level) / 2` of the normal distribution where sigma is known, else of
-        Student's t.
+        The quantile at `(1 + level) / 2` of the normal distribution where sigma is
+        known, else of Student's t.
         """
         check_level(level)
-        freedom, tail = self.degrees_of_freedom, 0.5 + 0.5 * level
+        freedom = self.degrees_of_freedom
+        tail = 0.5 + 0.5 * level
         noise_is_known = self.problem.sigma is not None or freedom < 1
         return float(ndtri(tail) if noise_is_known else stdtrit(freedom, tail))
 
     def linearized_interval(self, i: int, q: float) -> tuple[tuple[float, float], ...]:
-        """Pieces of the interval of parameter `i`, within `q` standard errors at each minimum.
+        """Pieces of the interval of parameter `i`, within `q` standard errors at each
+        minimum.
 
-        Equation: `x -+ error sqrt(q^2 - (S - S_best) / s^2)` at a minimum x of sum of squares S, s
-        the noise; of what is fitted in its logarithm `x exp(-+ .. / x)`; cut at the bounds.
+        Equation: `x -+ error sqrt(q^2 - (S - S_best) / s^2)` at a minimum x of sum of
+        squares S, s the noise; of what is fitted in its logarithm `x exp(-+ .. / x)`;
+        cut at the bounds.
         """
-        low, high = self.bounds[0][i], self.bounds[1][i]
-        minima = [(self.value[i], self.standard_error[i], 0.0)]  # the last one: S - S_best
+        low = self.bounds[0][i]
+        high = self.bounds[1][i]
+        # the last one: S - S_best
+        minima = [(self.value[i], self.standard_error[i], 0.0)]
         for minimum in self.starts[1:]:
             more = minimum.sum_of_squares - self.starts[0].sum_of_squares
             if minimum.standard_error is not None and more < (q * self.noise) ** 2:
@@ -175,21 +196,27 @@ class Estimate(Generic[AnyLaw]):
             pieces.append(tuple(np.clip(ends, low, high)))
         return joined(pieces)
 
-    def linearized_intervals(self, level: float) -> tuple[tuple[tuple[float, float], ...], ...]:
+    def linearized_intervals(
+        self, level: float
+    ) -> tuple[tuple[tuple[float, float], ...], ...]:
         """The pieces of `linearized_interval` of each of the P parameters."""
         q = self.quantile(level)
         return tuple(self.linearized_interval(i, q) for i in range(len(self.names)))
 
     @property
     def can_be_profiled(self) -> bool:
-        """True for least squares within bounds: not for an admissible matrix or a robust loss."""
+        """True for least squares within bounds: not for an admissible matrix or a
+        robust loss.
+        """
         return self.loss == "squares" and self.problem.matrix is None
 
     @property
     def linearization_misleads(self) -> bool:
-        """True where the sum of squares is visibly no parabola: standard errors may mislead.
+        """True where the sum of squares is visibly no parabola: standard errors may
+        mislead.
 
-        That is in a valley, at a bound, with several minima, of a stiffness that is hardly seen.
+        That is in a valley, at a bound, with several minima, of a stiffness that is
+        hardly seen.
         """
         if not self.can_be_profiled or not self.converged:
             return False
@@ -197,7 +224,9 @@ class Estimate(Generic[AnyLaw]):
             return True
         if not np.isfinite(self.noise):
             return False  # the errors are unknown
-        wide = self.problem.parameters.log & (self.standard_error > HARDLY_SEEN * self.value)
+        wide = self.problem.parameters.log & (
+            self.standard_error > HARDLY_SEEN * self.value
+        )
         pieces = self.linearized_intervals(LEVEL)
         low, high = np.array([(each[0][0], each[-1][1]) for each in pieces]).T
         at_end = (low <= self.bounds[0]) | (high >= self.bounds[1])

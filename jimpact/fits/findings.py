@@ -1,4 +1,6 @@
-"""Findings of a fit as data: what kind, which shots, which numbers, and the sentences for them."""
+"""Findings of a fit as data: what kind, which shots, which numbers, and the sentences
+for them.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +15,9 @@ KINDS = {
     "no_approach": "no contact approaches in these shots",
     "copies": "shots are one, several times or scaled",
     "left_out": "shots whose impacts fail, or whose derivatives cannot be used",
-    "unknown_correction": "shots corrected in a way that is not known, with errors of v-",
+    "unknown_correction": (
+        "shots corrected in a way that is not known, with errors of v-"
+    ),
     # of the law
     "lack_of_fit": "a test rejects the law",
     "law_fails": "the fitted law ends with a failure, or its values are not finite",
@@ -38,10 +42,12 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One result of a test of data or fit: its kind, the sentence for it, shots, numbers.
+    """One result of a test of data or fit: its kind, the sentence for it, shots,
+    numbers.
 
-    `kind`, a key of `KINDS`, and `numbers` by name are for programs; `line` is for the report,
-    `reservation` for a sentence that quotes the fit ('': nothing); `shots` are labels.
+    `kind`, a key of `KINDS`, and `numbers` by name are for programs; `line` is for the
+    report, `reservation` for a sentence that quotes the fit ('': nothing); `shots` are
+    labels.
     """
 
     kind: str
@@ -51,12 +57,18 @@ class Finding:
     numbers: Mapping[str, float] = field(default_factory=dict)
 
 
-def findings(checks: Sequence[Callable[[Any], Iterator[Finding]]], judged: Any) -> list[Finding]:
-    """All findings of these checks, in their order; `judged` is the argument of each check."""
+def findings(
+    checks: Sequence[Callable[[Any], Iterator[Finding]]], judged: Any
+) -> list[Finding]:
+    """All findings of these checks, in their order; `judged` is the argument of each
+    check.
+    """
     return [found for check in checks for found in check(judged)]
 
 
-def of_sentences(lines: Sequence[str], reservations: Sequence[str]) -> tuple[Finding, ...]:
+def of_sentences(
+    lines: Sequence[str], reservations: Sequence[str]
+) -> tuple[Finding, ...]:
     """Findings from the sentences of a file of a build before 0.2, which had no kinds.
 
     `lines` are those of the report, `reservations` those to quote with the values.
@@ -68,7 +80,9 @@ def of_sentences(lines: Sequence[str], reservations: Sequence[str]) -> tuple[Fin
     }
 
     def kind(line: str) -> str:
-        """The kind of a sentence by its words; '' for kinds that no other result depends on."""
+        """The kind of a sentence by its words; '' for kinds that no other result
+        depends on.
+        """
         kinds = [k for words, k in starts.items() if line.startswith(words)]
         kinds += [k for words, k in contain.items() if words in line]
         return next(iter(kinds), "")

@@ -1,4 +1,6 @@
-"""`fit`: parameters of a law from measured velocities, with errors; many fits side by side."""
+"""`fit`: parameters of a law from measured velocities, with errors; many fits side by
+side.
+"""
 
 import functools
 import time
@@ -62,71 +64,82 @@ def fit(
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 
-    Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values, and, with
-    priors, `+ sum ((x - mean) / std)^2`. With errors of v- (`sigma_pre`, `covariance`) it is the
-    joint misfit of v- and v+, and the true v- of each shot are searched for with the parameters
-    (errors in both variables): they do not bias them. `search.loss` may take the place of the
-    square.
+    Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured
+    values, and, with priors, `+ sum ((x - mean) / std)^2`. With errors of v-
+    (`sigma_pre`, `covariance`) it is the joint misfit of v- and v+, and the true v- of
+    each shot are searched for with the parameters (errors in both variables): they do
+    not bias them. `search.loss` may take the place of the square.
 
     Args:
-        law: the law to fit; its parameters are the start values. All contacts share one value of
-            a scalar field; an (m,) field is free contact by contact. The stiffnesses of `LZB` with
-            equal exponents: only their ratios matter, so that of contact 1 is fixed; a scalar
-            stiffness is fixed by default, and naming it in `free` is an error.
-            The (m, m) matrix of a `RestitutionMatrix` is the best one that is admissible in all its
-            scenes for every approach velocity; the start must be so.
-            Or a `FitProblem`, which holds the next three arguments, `bounds`, `priors`, `ties`.
+        law: the law to fit; its parameters are the start values. All contacts share one
+            value of a scalar field; an (m,) field is free contact by contact. The
+            stiffnesses of `LZB` with equal exponents: only their ratios matter, so that
+            of contact 1 is fixed; a scalar stiffness is fixed by default, and naming it
+            in `free` is an error.
+            The (m, m) matrix of a `RestitutionMatrix` is the best one that is
+            admissible in all its scenes for every approach velocity; the start must be
+            so.
+            Or a `FitProblem`, which holds the next three arguments, `bounds`, `priors`,
+            `ties`.
         scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.
-        free: names of fields or entries ('restitution[2]'), or {field: True, or a boolean mask over
-            contacts, or numbers of groups}: contacts with equal numbers share one value, 0 is
-            fixed. Also parts of the scene that all shots share, each with a prior: 'mass[2]' [kg],
-            'gaps[1]' [m], 'tilt[1]' [rad], by which the normal of a planar contact turns towards
-            its tangent; `Fit.scene` has them. Momentum and energy are judged with them.
+        free: names of fields or entries ('restitution[2]'), or {field: True, or a
+            boolean mask over contacts, or numbers of groups}: contacts with equal
+            numbers share one value, 0 is fixed. Also parts of the scene that all shots
+            share, each with a prior: 'mass[2]' [kg], 'gaps[1]' [m], 'tilt[1]' [rad], by
+            which the normal of a planar contact turns towards its tangent; `Fit.scene`
+            has them. Momentum and energy are judged with them.
         bounds: {field or entry: (low, high)}; default [0, 1] for restitution, > 0 for
             stiffness, ...
-        priors: {parameter or field: (mean, standard deviation), or `ji.Normal`}: what is known of a
-            parameter besides the data; each counts as one more measured value. The data need a
-            `sigma` (or `resolution`), which priors weigh against. Parts of a scene are searched
-            within ten standard deviations.
-        ties: {field or entry: function}: what is not fitted but follows from other values, as in
-            {"stiffness[2]": lambda p: 2 * p["restitution"]}; `p` has all fields and entries of the
-            law by name. `Fit.tied` has the values with their errors. Functions must be
-            differentiable by JAX; each compiles a program of its own.
-        starts: number of starts: the first from the law's values, then random ones, the last third
-            around the best of these. None: the lowest of 128 to 1024 points, of which only
-            values are computed, and further ones around the best as long as they lower the sum of
-            squares by more than the noise of a value. Starts that stay behind others are given up.
-        profiles: whether intervals are those of `profile`; None: where standard errors cannot be
-            trusted (at a bound, in a valley, with several minima, or for weakly determined
-            parameters) and the law fits, of up to 3 parameters and 256 shots (64 with one start);
-            else the report says how to get them. True computes them at once, None on first
-            access, as by `print`, `warnings` or `intervals`.
+        priors: {parameter or field: (mean, standard deviation), or `ji.Normal`}: what
+            is known of a parameter besides the data; each counts as one more measured
+            value. The data need a `sigma` (or `resolution`), which priors weigh
+            against. Parts of a scene are searched within ten standard deviations.
+        ties: {field or entry: function}: what is not fitted but follows from other
+            values, as in {"stiffness[2]": lambda p: 2 * p["restitution"]}; `p` has all
+            fields and entries of the law by name. `Fit.tied` has the values with their
+            errors. Functions must be differentiable by JAX; each compiles a program of
+            its own.
+        starts: number of starts: the first from the law's values, then random ones, the
+            last third around the best of these. None: the lowest of 128 to 1024 points,
+            of which only
+            values are computed, and further ones around the best as long as they lower
+            the sum of squares by more than the noise of a value. Starts that stay
+            behind others are given up.
+        profiles: whether intervals are those of `profile`; None: where standard errors
+            cannot be trusted (at a bound, in a valley, with several minima, or for
+            weakly determined parameters) and the law fits, of up to 3 parameters and
+            256 shots (64 with one start); else the report says how to get them. True
+            computes them at once, None on first access, as by `print`, `warnings` or
+            `intervals`.
         search: method, loss, limits and progress, see `Search`.
 
     Returns:
-        `Fit` (`help("jimpact.fits.report.Fit")`); `print` gives its report, `ji.plot.fit` a
-        picture.
+        `Fit` (`help("jimpact.fits.report.Fit")`); `print` gives its report,
+        `ji.plot.fit` a picture.
 
-    Shots whose impact fails at the best parameters, or whose derivatives are not finite or
-    absurdly large, are left out, and `Fit.warnings` names them. `Fit.warnings` also says whether
-    the law fits at all ("Lack of fit"), which shots are suspicious, and what is wrong with the
-    data.
+    Shots whose impact fails at the best parameters, or whose derivatives are not finite
+    or absurdly large, are left out, and `Fit.warnings` names them. `Fit.warnings` also
+    says whether the law fits at all ("Lack of fit"), which shots are suspicious, and
+    what is wrong with the data.
 
     Raises:
-        ValueError: unknown field, no free parameter, masks or bounds that do not fit, priors
-            outside bounds or without sigma, parts of a scene without a prior, ties in a circle or
-            outside a domain, bodies of scene and experiments that differ in number, derivatives
-            that are not finite.
+        ValueError: unknown field, no free parameter, masks or bounds that do not fit,
+            priors outside bounds or without sigma, parts of a scene without a prior,
+            ties in a circle or outside a domain, bodies of scene and experiments that
+            differ in number, derivatives that are not finite.
 
     >>> import jimpact as ji
-    >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
+    >>> data = ji.Experiments(
+    ...     pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]]
+    ... )
     >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
     >>> round(float(result.law.restitution), 4)
     0.4
     """
     check_kind("search", search, Search)
-    method, seed = search.method, search.seed
+    method = search.method
+    seed = search.seed
     steps = step_limit(method, search.max_steps)
     if starts is not None:
         as_whole("starts", starts, 1)
@@ -134,7 +147,8 @@ def fit(
         others: tuple[Any, ...] = (scene, experiments, bounds, priors, ties)
         if free is not DEFAULT_FREE or any(each is not None for each in others):
             raise ValueError(
-                "Arguments `scene`, `experiments`, `free`, `bounds`, `priors` and `ties` must be "
+                "Arguments `scene`, `experiments`, `free`, `bounds`, `priors` and "
+                "`ties` must be "
                 "left out where a FitProblem is given, which holds its own."
             )
         problem = law
@@ -142,8 +156,12 @@ def fit(
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
     data = problem.experiments
     if data is not None and (doubt := wrong_unit(data, problem.scene)):
-        warnings.warn(doubt, stacklevel=2)  # before a search that may take long and find nothing
-    deadline = np.inf if search.limit is None else time.monotonic() + float(search.limit)
+        # before a search that may take long and find nothing
+        warnings.warn(doubt, stacklevel=2)
+    if search.limit is None:
+        deadline = np.inf
+    else:
+        deadline = time.monotonic() + float(search.limit)
     with progress_bar(search.progress) as show:
         solver = Solver(method, steps, show, deadline)
         solution = find_minima(problem, starts, seed, solver)
@@ -154,7 +172,9 @@ def fit(
         problem = problem.with_errors_before(solution.slopes)
         robust = None
         if search.loss != "squares":
-            problem, solution, robust = robust_minimum(problem, solution, search.loss, solver)
+            problem, solution, robust = robust_minimum(
+                problem, solution, search.loss, solver
+            )
     result = replace(as_fit(problem, solution, search, robust), wants_profiles=profiles)
     if profiles:
         _ = result.profiles  # asked for: computed here
@@ -162,10 +182,14 @@ def fit(
 
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
-    """Raise a ValueError if derivatives of measured values at the minimum are not finite."""
+    """Raise a ValueError if derivatives of measured values at the minimum are not
+    finite.
+    """
     lost = np.flatnonzero(~np.isfinite(solution.starts[0].jacobian).all(axis=1))
     if len(lost):
-        at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
+        at = ", ".join(
+            f"{name} = {x:g}" for name, x in zip(problem.names, solution.value)
+        )
         which = listed([str(i + 1) for i in lost])
         raise ValueError(
             f"Argument `law` must have finite derivatives, but at {at} those of "
@@ -174,7 +198,9 @@ def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
 
 
 def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
-    """The problem without the shots where `lost` (K,) is True, whose labels go to `left_out`."""
+    """The problem without the shots where `lost` (K,) is True, whose labels go to
+    `left_out`.
+    """
     assert problem.experiments is not None
     labels = (problem.experiments.shots[k] for k in np.flatnonzero(lost))
     used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
@@ -190,14 +216,21 @@ def as_fit(
         problem: that was solved.
         solution: its minima.
         search: options of the search.
-        robust: noise times the root of the degrees of freedom after a robust loss, or None.
+        robust: noise times the root of the degrees of freedom after a robust loss, or
+            None.
     """
-    judged = Judged(replace(problem, scene=problem.to_scene(solution.value)), solution, robust)
+    judged = Judged(
+        replace(problem, scene=problem.to_scene(solution.value)), solution, robust
+    )
     errors = judged.errors
-    starts, limit = [], solution.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
+    starts = []
+    limit = solution.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
     for end in solution.starts:
         matters = not end.sum_of_squares > limit  # also where the noise is NaN
-        error = uncertainty(problem, end, errors.noise).standard_error if matters else None
+        if matters:
+            error = uncertainty(problem, end, errors.noise).standard_error
+        else:
+            error = None
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
         law=problem.to_law(solution.value),
@@ -235,8 +268,9 @@ def fit_many(
 ) -> "Fits[AnyLaw]":
     """`fit` of one law to each of many data sets, side by side in one compiled program.
 
-    Data sets of up to 4, 8, 16, ... shots share a program. Arguments and errors as of `fit`;
-    `starts` are those of each data set; around the best, and in scans, none are added.
+    Data sets of up to 4, 8, 16, ... shots share a program. Arguments and errors as of
+    `fit`; `starts` are those of each data set; around the best, and in scans, none are
+    added.
 
     Args:
         law: start values of all.
@@ -253,14 +287,17 @@ def fit_many(
         progress: a bar on stderr; None: on a terminal.
 
     Returns:
-        `Fits`: arrays of values, and a `Fit` for each data set, in their order, made when it is
-        asked for.
+        `Fits`: arrays of values, and a `Fit` for each data set, in their order, made
+        when it is asked for.
 
     Raises:
         ValueError: as of `fit`.
 
     >>> import jimpact as ji
-    >>> sets = [ji.Experiments([1.0, 0.0], [0.5 - 0.5 * e, 0.5 + 0.5 * e]) for e in (0.4, 0.8)]
+    >>> sets = [
+    ...     ji.Experiments([1.0, 0.0], [0.5 - 0.5 * e, 0.5 + 0.5 * e])
+    ...     for e in (0.4, 0.8)
+    ... ]
     >>> fits = ji.fit_many(ji.Newton(0.9), ji.chain([1.0, 1.0]), sets)
     >>> [round(float(each.law.restitution), 6) for each in fits]
     [0.4, 0.8]
@@ -272,14 +309,17 @@ def fit_many(
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
-    # problems of other shots follow from the first one, but where more depends on the data:
-    # scenes, errors of v-, and the coarse tolerance that their noise allows
+    # problems of other shots follow from the first one, but where more depends on the
+    # data: scenes, errors of v-, and the coarse tolerance that their noise allows
     follow = scene is not None and first.before is None
     follow &= getattr(first.law, "rtol", None) != COARSE_RTOL
     problems = [first]
     for data in many[1:]:
         only_shots = follow and data.scenes is None and data.sigma_pre is None
-        other = first.of_other(data, scene) if only_shots else of_shots(law, scene, data, *choice)
+        if only_shots:
+            other = first.of_other(data, scene)
+        else:
+            other = of_shots(law, scene, data, *choice)
         problems.append(other)
     each: dict[int, Ends] = {}  # of the starts of a data set
     with progress_bar(progress) as show:
@@ -301,7 +341,9 @@ def fit_many(
             return made_now(k)
 
     def made_now(k: int) -> Fit[AnyLaw]:
-        """The `Fit` of data set k; if it has unusable shots, fitted anew without these."""
+        """The `Fit` of data set k; if it has unusable shots, fitted anew without
+        these.
+        """
         solution = solution_of(problems[k], each[k])
         search = Search(seed=seed, max_steps=max_steps, progress=False)
         if unusable(problems[k], solution).any():
@@ -316,7 +358,9 @@ def fit_many(
 
 
 def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
-    """Indices of problems, grouped by the shapes of their arrays: a group shares one program."""
+    """Indices of problems, grouped by the shapes of their arrays: a group shares one
+    program.
+    """
     groups: dict[Any, list[int]] = {}
     for k, problem in enumerate(problems):
         leaves, structure = jax.tree.flatten(problem.for_compiled())
@@ -326,10 +370,12 @@ def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class Fits(Sequence[Fit[AnyLaw]]):
-    """Fits of one law to S data sets: `value` (S, P) by `names`, and a `Fit` each when asked for.
+    """Fits of one law to S data sets: `value` (S, P) by `names`, and a `Fit` each when
+    asked for.
 
-    `squares` (S,) are the sums of squared weighted residuals, `converged` (S,) which searches have
-    ended. `fits[k]` makes errors and report of one; so does a loop over all.
+    `squares` (S,) are the sums of squared weighted residuals, `converged` (S,) which
+    searches have ended. `fits[k]` makes errors and report of one; so does a loop over
+    all.
     """
 
     names: tuple[str, ...]
@@ -343,15 +389,17 @@ class Fits(Sequence[Fit[AnyLaw]]):
 
     def __getitem__(self, k: Any) -> Any:
         each = range(len(self))[k]
-        return [self._made(i) for i in each] if isinstance(each, range) else self._made(each)
+        if isinstance(each, range):
+            return [self._made(i) for i in each]
+        return self._made(each)
 
 
 @dataclass(frozen=True, eq=False)
 class Refits:
     """Parameters `value` (B, P), by `names`, of fits to changed data.
 
-    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s]; `converged`
-    (B,) which of the fits have.
+    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s];
+    `converged` (B,) which of the fits have.
     """
 
     names: tuple[str, ...]
@@ -374,10 +422,11 @@ def bootstrap(
     workers: int | None = None,
     progress: float | None = None,
 ) -> Refits:
-    """Fits to data that the fitted law made, with the noise of the fit (parametric bootstrap).
+    """Fits to data that the fitted law made, with the noise of the fit.
 
-    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else `fit.noise`. With
-    errors of v-, v- and v+ are drawn around the true v- of the fit, and v+ of the law there.
+    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else
+    `fit.noise`. With errors of v-, v- and v+ are drawn around the true v- of the fit,
+    and v+ of the law there.
 
     Args:
         fit: with a known noise.
@@ -393,7 +442,9 @@ def bootstrap(
         ValueError: samples < 1; a noise that is not known; a robust loss.
 
     >>> import jimpact as ji
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.11, 0.88], [0.2, 1.81]], sigma=0.02)
+    >>> data = ji.Experiments(
+    ...     [[1.0, 0.0], [2.0, 0.0]], [[0.11, 0.88], [0.2, 1.81]], sigma=0.02
+    ... )
     >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
     >>> spread = ji.bootstrap(result).value.std()
     >>> bool(abs(spread / result.standard_error[0] - 1) < 0.1)
@@ -404,7 +455,9 @@ def bootstrap(
     as_workers(workers)
     check_squares("fit", fit)
     if not np.isfinite(fit.noise):
-        raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
+        raise ValueError(
+            "Argument `fit` must have a known noise, but its noise is not finite."
+        )
     problem = fit.problem
     rng = np.random.default_rng(seed)
     if problem.before is not None:
@@ -426,13 +479,17 @@ def bootstrap(
     return _refits(fit, resampled, workers, progress)
 
 
-def _measured_again(fit: Fit, samples: int, rng: np.random.Generator) -> tuple[Any, Any]:
+def _measured_again(
+    fit: Fit, samples: int, rng: np.random.Generator
+) -> tuple[Any, Any]:
     """v+ and v- (B, K, n) of shots measured again, at the true v- of the fit."""
     problem = fit.problem
     assert problem.before is not None
     assert fit.search.pre is not None
     assert fit.slopes is not None
-    shift = np.einsum("kij,kj->ki", fit.slopes, problem.velocities_before - fit.search.pre)
+    shift = np.einsum(
+        "kij,kj->ki", fit.slopes, problem.velocities_before - fit.search.pre
+    )
     before, after = problem.before.drawn(rng, (samples, *fit.search.pre.shape))
     pre = fit.search.pre + fit.noise * before
     post = problem.before.corrected(pre, fit.predicted - shift + fit.noise * after)
@@ -440,11 +497,13 @@ def _measured_again(fit: Fit, samples: int, rng: np.random.Generator) -> tuple[A
 
 
 @in_own_precision
-def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | None = None) -> Refits:
-    """A fit without each of the K shots in turn; `predicted` (K, n) is of the shot left out.
+def leave_one_out(
+    fit: Fit, *, workers: int | None = None, progress: float | None = None
+) -> Refits:
+    """A fit without each of the K shots; `predicted` (K, n) is of the shot left out.
 
-    `measured - predicted` is an honest error of prediction: laws with different numbers of
-    parameters may be compared by it.
+    `measured - predicted` is an honest error of prediction: laws with different numbers
+    of parameters may be compared by it.
 
     Args:
         fit: of K >= 2 shots.
@@ -465,12 +524,21 @@ def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | Non
     """
     as_workers(workers)
     check_squares("fit", fit)
-    shots = 0 if fit.experiments is None else len(fit.predicted)
+    if fit.experiments is None:
+        shots = 0
+    else:
+        shots = len(fit.predicted)
     if shots < 2:
-        raise ValueError(f"Argument `fit` must be of at least 2 shots, but has {shots}.")
+        raise ValueError(
+            f"Argument `fit` must be of at least 2 shots, but has {shots}."
+        )
     each = np.eye(shots)[:, :, None] * np.ones(fit.predicted.shape)
-    refits = _refits(fit, [fit.problem.weighed(1 - shot) for shot in each], workers, progress)
-    return replace(refits, predicted=refits.predicted[np.arange(shots), np.arange(shots)])
+    refits = _refits(
+        fit, [fit.problem.weighed(1 - shot) for shot in each], workers, progress
+    )
+    return replace(
+        refits, predicted=refits.predicted[np.arange(shots), np.arange(shots)]
+    )
 
 
 def _refits(
@@ -481,5 +549,8 @@ def _refits(
     with progress_bar(progress) as show:
         solver = Solver(show=show, workers=workers)
         _, ends = solved(problems, points, solver, FINE_OF_MANY)
-    predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
+    if fit.predicted.ndim:
+        predicted = ends.predicted[:, : len(fit.predicted)]
+    else:
+        predicted = ends.predicted
     return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

@@ -13,32 +13,44 @@ def check_level(level: float) -> None:
     check_shape("level", level, (), "one number")
     check_values("level", level)
     if not 0 < level < 1:
-        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level!r}.")
+        raise ValueError(
+            f"Argument `level` must lie in (0, 1), but has value {level!r}."
+        )
 
 
-def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
-    """Pieces (low, high) of a confidence interval as text; ends of the domain are left out."""
+def pieces_in_words(
+    pieces: Iterable[tuple[float, float]], domain: tuple[float, float]
+) -> str:
+    """Pieces (low, high) of a confidence interval as text; ends of the domain are left
+    out.
+    """
     return " or ".join(_piece(*ends, domain) for ends in pieces)
 
 
 def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
-    """One piece of an interval as text: 'a to b', 'at least a', 'at most b' or 'anything'."""
-    open_low, open_high = low <= domain[0], high >= domain[1]
+    """One piece of an interval as text: 'a to b', 'at least a', 'at most b' or
+    'anything'.
+    """
+    open_low = low <= domain[0]
+    open_high = high >= domain[1]
     if open_low and open_high:
         return "anything"
     if open_low or open_high:
-        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+        if open_low:
+            return f"at most {high:.5g}"
+        return f"at least {low:.5g}"
     return f"{low:.5g} to {high:.5g}"
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below
+    `limit`.
 
-    `deviance` is the sum of squares with the parameter fixed, less its least value, over the noise
-    variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
-    `domain` means that the data do not bound the parameter there. `better`: values of a minimum
-    below that of the fit, or None.
+    `deviance` is the sum of squares with the parameter fixed, less its least value,
+    over the noise variance. `intervals` are the pieces of the confidence interval at
+    `level`, in order; an end at `domain` means that the data do not bound the parameter
+    there. `better`: values of a minimum below that of the fit, or None.
     """
 
     name: str
@@ -64,8 +76,12 @@ class Profile:
 
     @property
     def open_ends(self) -> tuple[bool, bool]:
-        """True where the interval reaches the lower, and the upper end of the domain."""
-        return self.intervals[0][0] <= self.domain[0], self.intervals[-1][1] >= self.domain[1]
+        """True where the interval reaches the lower, and the upper end of the
+        domain.
+        """
+        return self.intervals[0][0] <= self.domain[0], self.intervals[-1][
+            1
+        ] >= self.domain[1]
 
     @property
     def determines(self) -> bool:

@@ -1,12 +1,14 @@
-"""Fits of a restitution matrix: the region in which it is consistent for every approach.
+"""Fits of a restitution matrix: the region in which it is consistent for every
+approach.
 
-The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
-asks `|E x| <= |x|` in the norm of G^-1). Residuals are linear in E, so a fit goes where it likes
-and then to the admissible matrix of the least sum of squares.
+The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E
+copositive}` is convex (each x >= 0 asks `|E x| <= |x|` in the norm of G^-1). Residuals
+are linear in E, so a fit goes where it likes and then to the admissible matrix of the
+least sum of squares.
 
-Axes: S scenes, m contacts, E = m m entries, Q variables y of the solver, F = 2^m - 1 faces
-(supports) of the cone of approaches x >= 0, C conditions `slack(y) >= 0`. G is the Delassus matrix
-in units of `kinetic_norm`.
+Axes: S scenes, m contacts, E = m m entries, Q variables y of the solver, F = 2^m - 1
+faces (supports) of the cone of approaches x >= 0, C conditions `slack(y) >= 0`. G is
+the Delassus matrix in units of `kinetic_norm`.
 """
 
 from itertools import product
@@ -31,8 +33,8 @@ from jimpact.tools.status import CODE
 
 # A point drawn back stops short of the boundary by this share of the way, times eps.
 _SHORT = 16.0
-# Least damping, relative to the largest curvature: keeps the matrix of the dual problem regular
-# where shots are too few to determine E.
+# Least damping, relative to the largest curvature: keeps the matrix of the dual problem
+# regular where shots are too few to determine E.
 _LEAST_DAMPING = {"float64": 1e-8, "float32": 1e-4}
 _SCALINGS = 60  # of the ray: each closes in on the boundary quadratically
 
@@ -42,7 +44,8 @@ LARGEST = 6
 _ROUNDING = {"float64": 1e-9, "float32": 1e-4}
 _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no inverse
 _CUTS = 60  # rounds of cutting planes, mostly 10 to 20
-_FLAT = 1e-9  # share of the longest derivative below which a condition does not depend on y
+# share of the longest derivative below which a condition does not depend on y
+_FLAT = 1e-9
 _WORST = 2  # new cuts of each scene and contact
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
@@ -52,7 +55,8 @@ _Share = tuple[Float[Array, ""], Bool[Array, ""], Int[Array, ""]]
 
 
 class _Cut(NamedTuple):
-    """State of a search by cutting planes: the point z, and the Q active cuts that hold it.
+    """State of a search by cutting planes: the point z, and the Q active cuts that hold
+    it.
 
     `slacks` are those of the cuts at the first point y, `slopes` their derivatives.
     """
@@ -65,7 +69,8 @@ class _Cut(NamedTuple):
 
 
 class AdmissibleMatrices(eqx.Module):
-    """The set of y whose matrix `E = origin + map y` is admissible in S scenes and within bounds.
+    """The set of y whose matrix `E = origin + map y` is admissible in S scenes and
+    within bounds.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.2 and 6.3.
     """
@@ -84,7 +89,8 @@ class AdmissibleMatrices(eqx.Module):
         return e[None] * (self.closed[:, :, None] * self.closed[:, None, :])
 
     def elementwise(self, y: Float[Array, " Q"]) -> Float[Array, " L"]:
-        """Slacks of the conditions linear in y: `E`, `G^-1 (I + E)`, `y - low`, `high - y`.
+        """Slacks of the conditions linear in y: `E`, `G^-1 (I + E)`, `y - low`,
+        `high - y`.
 
         They must be >= 0; 1 where there is no bound.
         """
@@ -106,20 +112,27 @@ class AdmissibleMatrices(eqx.Module):
     def worst(self, y: Float[Array, " Q"]) -> Float[Array, "S F m"]:
         """Approaches x >= 0 of length 1, one for each face, that lose the least energy.
 
-        On each face, of the approaches with a given support, the minimizer of `x^T Q x` with `Q =
-        G^-1 - E^T G^-1 E` is an eigenvector of the smallest eigenvalue of that block of Q, if it
-        is positive (see `jimpact.theory.restitution_matrices`). Otherwise its positive part is an
-        approach all the same, with a condition of its own.
+        On each face, of the approaches with a given support, the minimizer of `x^T Q x`
+        with `Q = G^-1 - E^T G^-1 E` is an eigenvector of the smallest eigenvalue of
+        that block of Q, if it is positive (see `jimpact.theory.restitution_matrices`).
+        Otherwise its positive part is an approach all the same, with a condition of its
+        own.
         """
         m = self.closed.shape[1]
         q = self._dissipation(y)
-        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)  # (F, m) supports
+        # (F, m) supports
+        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)
         # larger than all eigenvalues: contacts outside of the support do not take part
         above = (m + 1.0) * (jnp.abs(q).max() + jnp.abs(self.inverse).max())
         inside = faces[:, :, None] * faces[:, None, :]
         outside = above * (1 - faces)[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
-        x = jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])[1][..., 0] * faces[None]
-        x = jnp.maximum(x * jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)[..., None], 0.0)
+        x = (
+            jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])[1][..., 0]
+            * faces[None]
+        )
+        x = jnp.maximum(
+            x * jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)[..., None], 0.0
+        )
         x = x * self.closed[:, None, :]
         norm = jnp.sqrt(jnp.sum(x**2, axis=-1, keepdims=True))
         x = x / jnp.where(norm > 0, norm, 1.0)
@@ -132,15 +145,20 @@ class AdmissibleMatrices(eqx.Module):
 
     @full_precision
     def nearest(
-        self, y: Float[Array, " Q"], hessian: Float[Array, "Q Q"], gradient: Float[Array, " Q"]
+        self,
+        y: Float[Array, " Q"],
+        hessian: Float[Array, "Q Q"],
+        gradient: Float[Array, " Q"],
     ) -> Float[Array, " Q"]:
         """The admissible z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`.
 
-        By cutting planes: conditions on the energy are concave, so that they lie below all their
-        tangents. Each step solves the quadratic program with the linear conditions, the cuts that
-        were active before, and the tangents at z of the conditions that are violated most.
+        By cutting planes: conditions on the energy are concave, so that they lie below
+        all their tangents. Each step solves the quadratic program with the linear
+        conditions, the cuts that were active before, and the tangents at z of the
+        conditions that are violated most.
         """
-        size, dtype = y.shape[0], y.dtype
+        size = y.shape[0]
+        dtype = y.dtype
         largest = jnp.max(jnp.diagonal(hessian))
         weight = _LEAST_DAMPING[str(dtype)] * jnp.where(largest > 0, largest, 1.0)
         hessian = hessian + weight * jnp.eye(size, dtype=dtype)
@@ -151,15 +169,17 @@ class AdmissibleMatrices(eqx.Module):
         worst = min(self.faces, _WORST * self.closed.size)  # number of new cuts
 
         def add_cuts(state: _Cut) -> _Cut:
-            """Cut at z, solve the quadratic program, and keep the cuts of the largest multipliers.
+            """Cut at z, solve the quadratic program, and keep the cuts of the largest
+            multipliers.
 
-            It ends where z satisfies all conditions on the energy: it is then the best of a set
-            that contains the admissible one.
+            It ends where z satisfies all conditions on the energy: it is then the best
+            of a set that contains the admissible one.
             """
             z = state.z
             energy, tangent = (x[linear_count:] for x in self.conditions(z))
             which = jnp.argsort(energy)[:worst]
-            new = energy[which] + tangent[which] @ (y - z), tangent[which]  # the tangents at y
+            # the tangents at y
+            new = energy[which] + tangent[which] @ (y - z), tangent[which]
             parts = zip(linear, (state.slacks, state.slopes), new)
             slacks, slopes = map(jnp.concatenate, parts)
             move, multipliers, solved = _quadratic(hessian, gradient, slacks, slopes)
@@ -171,52 +191,72 @@ class AdmissibleMatrices(eqx.Module):
 
         no_cuts = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
         start = _Cut(y, *no_cuts, jnp.asarray(True), jnp.asarray(0))
-        z = jax.lax.while_loop(lambda s: s.goes_on & (s.steps < _CUTS), add_cuts, start).z
+        z = jax.lax.while_loop(
+            lambda s: s.goes_on & (s.steps < _CUTS), add_cuts, start
+        ).z
         # cutting planes leave rounding
         share = self.share(z)
-        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (z - self.center)
+        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (
+            z - self.center
+        )
         return jnp.where(share < 1, inside, z)
 
     def share(self, y: Float[Array, " Q"]) -> Float[Array, ""]:
         """The largest s <= 1 with which `center + s (y - center)` is admissible.
 
-        First by the linear conditions; then it is shortened until the approaches of `worst`, which
-        change with s, gain no energy.
+        First by the linear conditions; then it is shortened until the approaches of
+        `worst`, which change with s, gain no energy.
         """
-        slack, target = self.elementwise(self.center), self.elementwise(y)
-        crossed = (target < 0) & (target < slack)  # the others do not change along the ray
-        share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
+        slack = self.elementwise(self.center)
+        target = self.elementwise(y)
+        # the others do not change along the ray
+        crossed = (target < 0) & (target < slack)
+        share = jnp.where(
+            crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0
+        ).min()
 
         def shortened(state: _Share) -> _Share:
-            """The share at which the approaches that are worst at the last one gain no energy."""
+            """The share at which the approaches that are worst at the last one gain no
+            energy.
+            """
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center))
             nearer = jnp.minimum(share, self._energy_share(y, x).min())
             return nearer, nearer < share, passes + 1
 
         first = (share, jnp.asarray(True), jnp.asarray(0))
-        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), shortened, first)[0]
+        return jax.lax.while_loop(
+            lambda s: s[1] & (s[2] < _SCALINGS), shortened, first
+        )[0]
 
-    def _energy_share(self, y: Float[Array, " Q"], x: Float[Array, "S F m"]) -> Float[Array, "S F"]:
-        """Shares s of the ray from the center to y at which `|E(s) x| = |x|`, of approaches x.
+    def _energy_share(
+        self, y: Float[Array, " Q"], x: Float[Array, "S F m"]
+    ) -> Float[Array, "S F"]:
+        """Shares s of the ray from the center to y at which `|E(s) x| = |x|`, of
+        approaches x.
 
-        Equation: `E(s) x = u + s w`, u = E(center) x, w = E(y) x - u, in the norm of G^-1: the
-        positive root of `|w|^2 s^2 + 2 (u, w) s = |x|^2 - |u|^2`; inf where there is none.
+        Equation: `E(s) x = u + s w`, u = E(center) x, w = E(y) x - u, in the norm of
+        G^-1: the positive root of `|w|^2 s^2 + 2 (u, w) s = |x|^2 - |u|^2`; inf where
+        there is none.
         """
         start = jnp.einsum("sij,sfj->sfi", self.matrices(self.center), x)
         rate = jnp.einsum("sij,sfj->sfi", self.matrices(y), x) - start
-        a, b = _square(self.inverse, rate), jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
+        a = _square(self.inverse, rate)
+        b = jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
         c = _square(self.inverse, x) - _square(self.inverse, start)  # > 0
         root = jnp.sqrt(jnp.maximum(b**2 + a * c, 0.0))
         # of a s^2 + 2 b s = c, in the form that does not cancel
-        above, below = jnp.where(b > 0, c, root - b), jnp.where(b > 0, root + b, a)
+        above = jnp.where(b > 0, c, root - b)
+        below = jnp.where(b > 0, root + b, a)
         return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
 
-    def conditions(self, y: Float[Array, " Q"]) -> tuple[Float[Array, " C"], Float[Array, "C Q"]]:
+    def conditions(
+        self, y: Float[Array, " Q"]
+    ) -> tuple[Float[Array, " C"], Float[Array, "C Q"]]:
         """Slacks of all conditions, >= 0 where admissible, and their derivatives.
 
-        First those of `elementwise`, then `x^T Q x` of the worst approach on each face, twice the
-        energy that is lost, with `Q = G^-1 - E^T G^-1 E`.
+        First those of `elementwise`, then `x^T Q x` of the worst approach on each face,
+        twice the energy that is lost, with `Q = G^-1 - E^T G^-1 E`.
         """
         x = self.worst(y)
 
@@ -236,10 +276,11 @@ def _quadratic(
     slack: Float[Array, " C"],
     rows: Float[Array, "C Q"],
 ) -> tuple[Float[Array, " Q"], Float[Array, " C"], Bool[Array, ""]]:
-    """Solve `min d^T H d / 2 + g^T d` with `slack + A d >= 0`, A the rows, by its dual LCP.
+    """Solve `min d^T H d / 2 + g^T d` with `slack + A d >= 0`, A the rows, by its dual
+    LCP.
 
-    Equation: `0 <= l  perp  A H^-1 A^T l + slack - A H^-1 g >= 0`, `d = H^-1 (A^T l - g)`; the rows
-    of A are scaled to length 1.
+    Equation: `0 <= l  perp  A H^-1 A^T l + slack - A H^-1 g >= 0`, `d = H^-1 (A^T l -
+    g)`; the rows of A are scaled to length 1.
 
     Returns:
         d, the multipliers l, True if the LCP is solved.
@@ -247,7 +288,8 @@ def _quadratic(
     length = jnp.sqrt(jnp.sum(rows**2, axis=1))
     depends = length > _FLAT * length.max()  # others are rounding
     scale = jnp.where(depends, 1 / jnp.where(depends, length, 1.0), 0.0)
-    rows, slack = rows * scale[:, None], jnp.where(depends, slack * scale, 1.0)
+    rows = rows * scale[:, None]
+    slack = jnp.where(depends, slack * scale, 1.0)
     factor = jax.scipy.linalg.cho_factor(hessian)
     unconstrained = -jax.scipy.linalg.cho_solve(factor, gradient)
     response = jax.scipy.linalg.cho_solve(factor, rows.T)  # H^-1 A^T
@@ -268,7 +310,8 @@ def matrix_region(
     start: Float[np.ndarray, " P"],
     ties: Ties,
 ) -> AdmissibleMatrices | None:
-    """The set of y whose `RestitutionMatrix` is admissible in each scene; None for other laws.
+    """The set of y whose `RestitutionMatrix` is admissible in each scene; None for
+    other laws.
 
     Args:
         law: at its start values.
@@ -278,33 +321,40 @@ def matrix_region(
         ties: of the fit.
 
     Raises:
-        ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
-            entries that leave no admissible choice, a tied matrix.
+        ValueError: redundant contacts, too many contacts, a start that is not
+            admissible, fixed entries that leave no admissible choice, a tied matrix.
     """
     if not encloses(law, scenes[0].contacts):
         return None
     if any(tie.field == "matrix" for tie in ties):
-        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
+        raise ValueError(
+            "Argument `ties` must not tie a `matrix` that has to stay admissible."
+        )
     owner = variables.owner
     # E = origin + moves y: each entry moves with the variable that owns it
     moves = np.where(owner[:, None] == np.arange(len(owner)), variables.scale, 0.0)
-    origin, start = np.where(owner < 0, variables.fixed, 0.0), variables.point(start)
+    origin = np.where(owner < 0, variables.fixed, 0.0)
+    start = variables.point(start)
     bounds = np.stack([variables.low, variables.high])
     is_bounded = np.isfinite(bounds[:, np.any(moves != 0, axis=0)]).any()
     dtype = variables.low.dtype
-    region = _region(scenes, dtype, origin, moves, bounds if is_bounded else None, start)
+    region = _region(
+        scenes, dtype, origin, moves, bounds if is_bounded else None, start
+    )
     slack, _ = _host_conditions(region, start)
     for name, kind in zip(_FACES, _kinds(region)):
         if slack[kind].min() < -_rounding(region):
             raise ValueError(
-                "Argument `law` must start from an admissible matrix, consistent for all approach "
+                "Argument `law` must start from an admissible matrix, consistent for "
+                "all approach "
                 f"velocities, but {name} fails by {-slack[kind].min():.3g}. "
                 "RestitutionMatrix(matrix, admissible=False) is fitted without that."
             )
     center = _inner_point(region, start)
     if center is None:
         raise ValueError(
-            "Argument `free` must leave an admissible choice: with the fixed entries every "
+            "Argument `free` must leave an admissible choice: with the fixed entries "
+            "every "
             "free entry is at the edge already."
         )
     return eqx.tree_at(lambda r: r.center, region, jnp.asarray(center, dtype))
@@ -325,12 +375,15 @@ def admissible_start(scenes: list[Scene]) -> Float[np.ndarray, "m m"]:
     """
     m = scenes[0].contacts
     half = 0.5 * np.eye(m).ravel()
-    region = _region(scenes, scenes[0].mass.dtype, np.zeros(m * m), np.eye(m * m), None, half)
+    region = _region(
+        scenes, scenes[0].mass.dtype, np.zeros(m * m), np.eye(m * m), None, half
+    )
     will_do = _host_conditions(region, half)[0].min() >= -_rounding(region)
     e = half if will_do else _inner_point(region, half)
     if e is None:
         raise ValueError(
-            "Argument `scene` must have an admissible restitution matrix to start from, but none "
+            "Argument `scene` must have an admissible restitution matrix to start "
+            "from, but none "
             "was found: give one, or RestitutionMatrix(matrix, admissible=False)."
         )
     return e.reshape(m, m)
@@ -344,12 +397,16 @@ def _region(
     bounds: Float[np.ndarray, "2 Q"] | None,
     center: Float[np.ndarray, " Q"],
 ) -> AdmissibleMatrices:
-    """The admissible set of `E = origin + mix y` in these scenes; of equal ones only one counts."""
+    """The admissible set of `E = origin + mix y` in these scenes; of equal ones only
+    one counts.
+    """
     m = scenes[0].contacts
     if m > LARGEST:
         raise ValueError(
-            f"Argument `law` must have at most {LARGEST} contacts to keep its matrix admissible, "
-            f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted without that."
+            f"Argument `law` must have at most {LARGEST} contacts to keep its matrix "
+            f"admissible, "
+            f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted "
+            f"without that."
         )
     distinct = np.unique([_inverse(scene) for scene in scenes], axis=0)
     arrays: Any = (origin, mix, distinct[:, :m], distinct[:, m], bounds, center)
@@ -358,11 +415,16 @@ def _region(
 
 def encloses(law: Law, contacts: int) -> bool:
     """True if a fit keeps the matrix of this law admissible."""
-    return isinstance(law, RestitutionMatrix) and law.admissible and law.matrix.shape[0] == contacts
+    return (
+        isinstance(law, RestitutionMatrix)
+        and law.admissible
+        and law.matrix.shape[0] == contacts
+    )
 
 
 def _inverse(scene: Scene) -> Float[np.ndarray, "rows m"]:
-    """G^-1 and one more row: 1 for closed contacts, 0 for open ones, which are decoupled.
+    """G^-1 and one more row: 1 for closed contacts, 0 for open ones, which are
+    decoupled.
 
     Equation: `G_ij = W_ij / (s_i s_j)`, W the Delassus matrix, s the `kinetic_norm`.
     """
@@ -371,7 +433,8 @@ def _inverse(scene: Scene) -> Float[np.ndarray, "rows m"]:
     smallest = np.linalg.eigvalsh(g)[0]
     if smallest < _REDUNDANT * len(g) * np.finfo(g.dtype).eps:
         raise ValueError(
-            "Argument `scene` must have no redundant contacts to keep a restitution matrix "
+            "Argument `scene` must have no redundant contacts to keep a restitution "
+            "matrix "
             f"admissible, but the smallest eigenvalue of G is {smallest:.3g}. "
             "RestitutionMatrix(matrix, admissible=False) is fitted without that."
         )
@@ -390,7 +453,9 @@ def _host_conditions(
 
 
 def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
-    """Slices of the list of all conditions for each kind in `_FACES`, in their order."""
+    """Slices of the list of all conditions for each kind in `_FACES`, in their
+    order.
+    """
     entries = len(region.origin)
     impulses = entries * (1 + len(region.inverse))
     return slice(entries), slice(entries, impulses), slice(-region.faces, None)
@@ -398,22 +463,29 @@ def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
 
 def _rounding(region: AdmissibleMatrices) -> float:
     """By how much rounding may break a condition."""
-    return _ROUNDING[str(region.center.dtype)] * float(np.abs(np.asarray(region.inverse)).max())
+    return _ROUNDING[str(region.center.dtype)] * float(
+        np.abs(np.asarray(region.inverse)).max()
+    )
 
 
 def _inner_point(
     region: AdmissibleMatrices, start: Float[np.ndarray, " Q"]
 ) -> Float[np.ndarray, " Q"] | None:
-    """A y near the start whose least slack is at least half of the largest possible; None: none.
+    """A y near the start whose least slack is at least half of the largest possible;
+    None: none.
 
-    Kelley's cutting planes: the least slack is concave in y, so it lies below all tangents so far;
-    the next y maximizes t under these (a linear program), in a box of 1 around the start.
+    Kelley's cutting planes: the least slack is concave in y, so it lies below all
+    tangents so far; the next y maximizes t under these (a linear program), in a box of
+    1 around the start.
     """
     from scipy.optimize import linprog  # late: slow to import
 
     free = np.any(np.asarray(region.map) != 0, axis=0)
     box = [*((x - moves, x + moves) for x, moves in zip(start, free)), (None, 1.0)]
-    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))  # rows: A, 1 of t, right side
+    # rows: A, 1 of t, right side
+    y = start
+    most = np.inf
+    planes = np.zeros((0, len(start) + 2))
     for _ in range(_CUTS):
         slack, rows = _host_conditions(region, y)
         moving = np.any(rows[:, free] != 0, axis=1)
@@ -426,12 +498,17 @@ def _inner_point(
         farthest = linprog(cost, A_ub=planes[:, :-1], b_ub=planes[:, -1], bounds=box)
         if not farthest.success or farthest.x[-1] <= 0:
             return None
-        y, most = farthest.x[:-1], farthest.x[-1]
+        y = farthest.x[:-1]
+        most = farthest.x[-1]
     return None
 
 
-def boundary(region: AdmissibleMatrices | None, y: Float[np.ndarray, " Q"]) -> tuple[str, ...]:
-    """Names of the admissibility conditions that are active at y, other than by fixed entries."""
+def boundary(
+    region: AdmissibleMatrices | None, y: Float[np.ndarray, " Q"]
+) -> tuple[str, ...]:
+    """Names of the admissibility conditions that are active at y, other than by fixed
+    entries.
+    """
     if region is None:
         return ()
     slack, rows = _host_conditions(region, y)

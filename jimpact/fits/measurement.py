@@ -1,4 +1,6 @@
-"""What was measured, with its errors: residuals of predictions, independent of each other."""
+"""What was measured, with its errors: residuals of predictions, independent of each
+other.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -14,8 +16,8 @@ from jimpact.fits.solve import AnyArray
 from jimpact.shots.covariances import whitening
 from jimpact.tools.compiling import full_precision
 
-# A trial whose outcome is meaningless gets a residual far above any honest one, so that a solver
-# turns back; inadmissible or energetic outcomes are only reported.
+# A trial whose outcome is meaningless gets a residual far above any honest one, so that
+# a solver turns back; inadmissible or energetic outcomes are only reported.
 PENALTY = 1e3  # times the largest measured value
 
 
@@ -24,15 +26,16 @@ PENALTY = 1e3  # times the largest measured value
 class Measurement:
     """Measured values (K, n) of K shots, or of any other shape, and their errors.
 
-    Equation: `residual = L (predicted - value) / sigma` with `L^-1 L^-T` the correlation of the
-    errors of a shot, or of all shots; L = 1 of independent ones.
+    Equation: `residual = L (predicted - value) / sigma` with `L^-1 L^-T` the
+    correlation of the errors of a shot, or of all shots; L = 1 of independent ones.
 
     Attributes:
         value: what was measured; NaN where no value was.
         weight: 1 / sigma, shaped like `value`; 0 where no value was measured.
         unit: the largest measured value.
         size: `unit |weight|`: residuals over it are of order 1.
-        mixing: L (K, n, n) of each shot, or (K, n, K, n) of all; None: errors are independent.
+        mixing: L (K, n, n) of each shot, or (K, n, K, n) of all; None: errors are
+            independent.
         sigma: standard errors, or None where they are not known, and on the device.
     """
 
@@ -54,7 +57,14 @@ class Measurement:
     ) -> "Measurement":
         """The measurement of values of these weights; its `size` follows from them."""
         unit = np.asarray(float(unit) or 1.0)
-        return cls(value, weight, unit, np.asarray(unit * np.linalg.norm(weight)), mixing, sigma)
+        return cls(
+            value,
+            weight,
+            unit,
+            np.asarray(unit * np.linalg.norm(weight)),
+            mixing,
+            sigma,
+        )
 
     @property
     def is_measured(self) -> Bool[np.ndarray, "*value"]:
@@ -64,7 +74,8 @@ class Measurement:
     def error(self, prediction: Prediction) -> Float[Array, "*value"]:
         """`predicted - value`; 0 where no value was measured.
 
-        Where the prediction is meaningless, it is off by `PENALTY` times the largest value.
+        Where the prediction is meaningless, it is off by `PENALTY` times the largest
+        value.
         """
         bad = jnp.broadcast_to(prediction.bad, self.value.shape)
         error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.value)
@@ -81,10 +92,14 @@ class Measurement:
 
         The factors belong to the independent residuals: L becomes `diag(factor) L`.
         """
-        used, mixing, weight = factor > 0, self.mixing, self.weight * factor
+        used = factor > 0
+        mixing = self.mixing
+        weight = self.weight * factor
         if mixing is not None:  # factors times L, instead of weights times factors
-            weight, scale = self.weight * used, np.where(used, factor, 1.0)
-            if mixing.ndim == 4:  # of all shots: those left out leave the covariance, too
+            weight = self.weight * used
+            scale = np.where(used, factor, 1.0)
+            # of all shots: those left out leave the covariance, too
+            if mixing.ndim == 4:
                 mixing = _without(np.asarray(mixing, float), used & self.is_measured)
             mixing = scale.reshape(scale.shape + (1,) * (mixing.ndim - 2)) * mixing
         value = np.where(used, self.value, np.nan)
@@ -93,20 +108,24 @@ class Measurement:
     def with_covariance(
         self, covariance: Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]
     ) -> "Measurement":
-        """The measurement with this covariance of the values of each shot, or of all shots.
+        """The measurement with this covariance of the values of each shot, or of all
+        shots.
 
-        Equation: sigma is the root of its diagonal; `L = F^-1`, F the Cholesky factor of the
-        correlation.
+        Equation: sigma is the root of its diagonal; `L = F^-1`, F the Cholesky factor
+        of the correlation.
         """
         measured = self.is_measured
         sigma, mixing = whitening(covariance, measured)
         # factors that a weight already has (shots left out) stay
         old = np.where(measured, np.asarray(self.sigma, float), 1.0)
-        weight, sigma = self.weight * old / sigma, np.where(measured, sigma, np.nan)
+        weight = self.weight * old / sigma
+        sigma = np.where(measured, sigma, np.nan)
         return Measurement.of(self.value, sigma, weight, self.unit, mixing)
 
     def filled(self, shots: Int[np.ndarray, " M"]) -> "Measurement":
-        """M >= K shots by their indices: all K of them, then copies, which have no weight."""
+        """M >= K shots by their indices: all K of them, then copies, which have no
+        weight.
+        """
         count = len(self.value)
         parts = self.value, self.weight, self.mixing
         value, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[shots], parts)
@@ -117,39 +136,55 @@ class Measurement:
         return replace(self, value=value, weight=weight, mixing=mixing)
 
     def independent(self, errors: Any) -> Float[np.ndarray, "..."]:
-        """Errors `L e / sigma` (K, n, ...) of variance 1, independent of each other, of errors e.
+        """Errors `L e / sigma` (K, n, ...) of variance 1, independent of each other, of
+        errors e.
 
         NaN counts as 0. Further axes hold derivatives, or samples.
         """
         errors = np.asarray(np.nan_to_num(errors))
         return np.asarray(_mixed(errors * self._weight_of(errors), self.mixing))
 
-    def errors_of(self, independent: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """The inverse of `independent`: `e = sigma L^-1 u` (K, n, ...) of independent errors u.
+    def errors_of(
+        self, independent: Float[np.ndarray, "..."]
+    ) -> Float[np.ndarray, "..."]:
+        """The inverse of `independent`: `e = sigma L^-1 u` (K, n, ...) of independent
+        errors u.
 
         NaN where no value was measured.
         """
         weight = self._weight_of(independent)
-        back = None if self.mixing is None else _inverse(np.asarray(self.mixing, float))
+        if self.mixing is None:
+            back = None
+        else:
+            back = _inverse(np.asarray(self.mixing, float))
         errors = _mixed(independent, back)
         return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
 
     def _weight_of(self, errors: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """The weights, with axes of length 1 behind, as many axes as these errors have."""
+        """The weights, with axes of length 1 behind, as many axes as these errors
+        have.
+        """
         more = (1,) * (errors.ndim - self.value.ndim)
         return np.asarray(self.weight, float).reshape((*self.value.shape, *more))
 
     def log_of_norm(self) -> float:
-        """`sum log(sigma sqrt(2 pi)) - log det L`: minus the logarithm of the density at error 0.
+        """`sum log(sigma sqrt(2 pi)) - log det L`: minus the logarithm of the density
+        at error 0.
 
         It needs a known sigma. L is triangular: log det L is the sum over its diagonal.
         """
         measured = self.is_measured
         shape = measured.shape
-        sigma, log_diagonal = np.broadcast_to(self.sigma, shape), np.zeros(shape)
+        sigma = np.broadcast_to(self.sigma, shape)
+        log_diagonal = np.zeros(shape)
         if self.mixing is not None:
-            size = measured.size if self.mixing.ndim == 4 else shape[1]
-            diagonal = np.diagonal(self.mixing.reshape(-1, size, size), axis1=1, axis2=2)
+            if self.mixing.ndim == 4:
+                size = measured.size
+            else:
+                size = shape[1]
+            diagonal = np.diagonal(
+                self.mixing.reshape(-1, size, size), axis1=1, axis2=2
+            )
             log_diagonal = np.log(diagonal.reshape(shape))
         log_sigma = np.log(sigma[measured] * math.sqrt(2 * math.pi))
         return float(np.sum(log_sigma - log_diagonal[measured]))
@@ -157,10 +192,15 @@ class Measurement:
 
 @full_precision
 def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
-    """`L e` of weighted errors e (K, n, ...), L = `mixing` of each shot or of all; e if None."""
+    """`L e` of weighted errors e (K, n, ...), L = `mixing` of each shot or of all; e if
+    None.
+    """
     if mixing is None:
         return errors
-    axes = "kij,kj...->ki..." if mixing.ndim == 3 else "kilj,lj...->ki..."
+    if mixing.ndim == 3:
+        axes = "kij,kj...->ki..."
+    else:
+        axes = "kilj,lj...->ki..."
     return xp.einsum(axes, mixing, errors)
 
 
@@ -175,6 +215,8 @@ def _inverse(mixing: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def _without(
     mixing: Float[np.ndarray, "K n K n"], used: Bool[np.ndarray, "K n"]
 ) -> Float[np.ndarray, "K n K n"]:
-    """L of all shots where only the values `used` take part: that of their part of `L^-1 L^-T`."""
+    """L of all shots where only the values `used` take part: that of their part of
+    `L^-1 L^-T`.
+    """
     factor = _inverse(mixing).reshape(used.size, used.size)
     return whitening((factor @ factor.T).reshape(mixing.shape), used)[1]

@@ -1,4 +1,6 @@
-"""What is observed of a law: velocities after impacts, or a user's own function of it."""
+"""What is observed of a law: velocities after impacts, or a user's own function of
+it.
+"""
 
 import dataclasses
 import math
@@ -21,20 +23,23 @@ from jimpact.tools.status import CODE, sign_tolerance
 # Outcomes whose velocities are meaningless.
 UNUSABLE = ("infeasible", "max_steps", "not_finite")
 
-# Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between, and the
-# copies that fill up cost far less than compiling another one.
+# Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between,
+# and the copies that fill up cost far less than compiling another one.
 FEWEST = 4
-# Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
-# itself, and the same in all shots.
+# Error of computed gap velocities, as a part of their noise. Ten times more: as large
+# as the noise itself, and the same in all shots.
 PART_OF_NOISE = 0.1
-# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 %; at one
-# ten times more derivatives lose another digit.
+# Tolerance for such data: one, since each compiles a program. Standard errors move by
+# .1 %; at one ten times more derivatives lose another digit.
 COARSE_RTOL = 1e-4
-_CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only these are asked for
+# remembers the shapes that it has seen; only these are asked for
+_CONTACT = jax.jit(contact_of)
 
 
 class Prediction(NamedTuple):
-    """Predictions of a law: values, `bad` where they are meaningless, and status codes (S,)."""
+    """Predictions of a law: values, `bad` where they are meaningless, and status codes
+    (S,).
+    """
 
     value: jax.Array
     bad: jax.Array
@@ -49,7 +54,9 @@ class Shots(eqx.Module):
     bodies: int = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
-        """v+ (K, n) after the impact of each shot, and its status code; bad if it is `UNUSABLE`."""
+        """v+ (K, n) after the impact of each shot, and its status code; bad if it is
+        `UNUSABLE`.
+        """
         law, scenes = placed(law, self.scenes)
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
         unusable = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
@@ -60,7 +67,8 @@ class Shots(eqx.Module):
 class Observed(eqx.Module):
     """The observable of a user's own function of a law.
 
-    `absolute`: it may see absolute stiffnesses (a force, a time), not only their ratios.
+    `absolute`: it may see absolute stiffnesses (a force, a time), not only their
+    ratios.
     """
 
     function: Callable[[Law], Any] = eqx.field(static=True)
@@ -74,21 +82,26 @@ class Observed(eqx.Module):
 
 def filled_count(count: int) -> int:
     """Number of shots of the program for `count` shots: the next of 4, 8, 16, ..."""
-    return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
+    if count <= FEWEST:
+        return FEWEST
+    return 2 ** math.ceil(math.log2(count))
 
 
 def tolerated(
     law: AnyLaw, scene: Scene | None, data: Experiments
 ) -> tuple[AnyLaw, tuple[str, ...]]:
-    """The law with `rtol = COARSE_RTOL` where the noise of the data allows it, and a note.
+    """The law with `rtol = COARSE_RTOL` where the noise of the data allows it, and a
+    note.
 
-    It does where `sigma` is known, and in each shot the smallest noise of a gap velocity,
-    `sqrt(sum (N_ij sigma_i)^2)`, times `PART_OF_NOISE` is at least `COARSE_RTOL` of the fastest
-    one. Laws with an `rtol`, more accurate ones and less accurate ones stay as they are.
+    It does where `sigma` is known, and in each shot the smallest noise of a gap
+    velocity, `sqrt(sum (N_ij sigma_i)^2)`, times `PART_OF_NOISE` is at least
+    `COARSE_RTOL` of the fastest one. Laws with an `rtol`, more accurate ones and less
+    accurate ones stay as they are.
     """
     if data.sigma is None or getattr(law, "rtol", COARSE_RTOL) is not None:
         return law, ()
-    pre, sigma = np.asarray(data.pre), np.asarray(data.sigma)
+    pre = np.asarray(data.pre)
+    sigma = np.asarray(data.sigma)
     shapes = _CONTACT.eval_shape(data.largest_scene(scene), pre[0])
     if not sign_tolerance(pre.dtype) < law.accuracy(shapes) < COARSE_RTOL:
         return law, ()
@@ -99,7 +112,9 @@ def tolerated(
     if not all(PART_OF_NOISE * s >= COARSE_RTOL * v for s, v in zip(noise, fastest)):
         return law, ()
     line = (
-        f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is computed with "
-        f"`rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give it an `rtol` to change that."
+        f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is "
+        f"computed with "
+        f"`rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give it an `rtol` to "
+        f"change that."
     )
     return dataclasses.replace(law, **{"rtol": COARSE_RTOL}), (line,)

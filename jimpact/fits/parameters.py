@@ -34,19 +34,23 @@ from jimpact.tools.checks import ABBREVIATIONS, check_kind, suggestion
 Limits = tuple[np.ndarray, np.ndarray]  # lowest and highest values (P,)
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
 OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
-OF_A_SCENE = ("mass", "gaps", "tilt")  # parts of a scene that a fit may have as parameters
+# parts of a scene that a fit may have as parameters
+OF_A_SCENE = ("mass", "gaps", "tilt")
 
-# What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
-# beyond, the softer contact has no further influence that a measurement could see.
+# What is fitted in its logarithm, a stiffness, may without bounds move this far from
+# its start: beyond, the softer contact has no further influence that a measurement
+# could see.
 LOG_RANGE = 1e4
-# A part of a scene is searched up to so many standard deviations of its prior away. With ten times
-# more, random starts would lie where the prior makes a fit hopeless.
+# A part of a scene is searched up to so many standard deviations of its prior away.
+# With ten times more, random starts would lie where the prior makes a fit hopeless.
 REACH = 10.0
 
-_ENTRY = re.compile(r"(\w+)\[([1-9]\d*(?:[,=][1-9]\d*)*)\]")  # a name with entries, from 1
+# a name with entries, from 1
+_ENTRY = re.compile(r"(\w+)\[([1-9]\d*(?:[,=][1-9]\d*)*)\]")
 
 
-# ---------------------------------------------------------------------------- names and entries
+# ---------------------------------------------------------------------------- names and
+# entries
 
 
 def entry_of(name: str) -> tuple[str, str | None]:
@@ -57,21 +61,31 @@ def entry_of(name: str) -> tuple[str, str | None]:
     (('restitution', None), ('restitution', '1=3'))
     """
     match = _ENTRY.fullmatch(name)
-    return (match[1], match[2]) if match else (name, None)
+    if match:
+        return (match[1], match[2])
+    return (name, None)
 
 
 def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
-    """Indices (from 0) of a name's entries in the flattened field, which has this shape."""
+    """Indices (from 0) of a name's entries in the flattened field, which has this
+    shape.
+    """
     _, entry = entry_of(name)
     if entry is None:
         return list(range(int(np.prod(shape, dtype=int))))
     members = [tuple(int(i) - 1 for i in part.split(",")) for part in entry.split("=")]
     for index in members:
-        inside = len(index) == len(shape) and all(0 <= i < n for i, n in zip(index, shape))
+        inside = len(index) == len(shape) and all(
+            0 <= i < n for i, n in zip(index, shape)
+        )
         if not inside:
-            kind = f"of shape {shape}" if shape else "one value for all contacts"
+            if shape:
+                kind = f"of shape {shape}"
+            else:
+                kind = "one value for all contacts"
             raise ValueError(
-                f"Argument `{argument}` must name entries that the field has, counted from 1, but "
+                f"Argument `{argument}` must name entries that the field has, counted "
+                f"from 1, but "
                 f"has {name!r} of a field that is {kind}."
             )
     return [int(np.ravel_multi_index(index, shape)) for index in members]
@@ -83,29 +97,37 @@ def domain_of(law: Law, field: str) -> Domain:
 
 
 def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:
-    """Scaled variables y of values x: `x / scale`, or `log(x)`; `xp` is NumPy or jax.numpy."""
+    """Scaled variables y of values x: `x / scale`, or `log(x)`; `xp` is NumPy or
+    jax.numpy.
+    """
     with np.errstate(divide="ignore"):
         return xp.where(log, xp.log(xp.where(log, x, 1.0)), x / scale)
 
 
 def unscaled(y: Any, scale: Any, log: Any, xp: Any = np) -> Any:
-    """Values x of scaled variables y: `scale y`, or `exp(y)`; `xp` is NumPy or jax.numpy."""
+    """Values x of scaled variables y: `scale y`, or `exp(y)`; `xp` is NumPy or
+    jax.numpy.
+    """
     return xp.where(log, xp.exp(xp.where(log, y, 0.0)), y * scale)
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """P free parameters. Each moves one or several of the Q entries of the named fields.
+    """P free parameters. Each moves one or several of the Q entries of the named
+    fields.
 
-    Entries are numbered through the flattened fields, in the order of `fields`; entries in no
-    group are fixed. (All entries are listed so that a compiled fit does not depend on the groups.)
+    Entries are numbered through the flattened fields, in the order of `fields`; entries
+    in no group are fixed. (All entries are listed so that a compiled fit does not
+    depend on the groups.)
     """
 
     fields: tuple[str, ...]
     names: tuple[str, ...]
-    groups: tuple[tuple[int, ...], ...]  # for each parameter, the entries that share its value
+    # for each parameter, the entries that share its value
+    groups: tuple[tuple[int, ...], ...]
     log: np.ndarray  # (P,) True where a parameter is fitted in its logarithm
-    ratios: bool = False  # True where the stiffness of contact 1 is held: only ratios matter
+    # True where the stiffness of contact 1 is held: only ratios matter
+    ratios: bool = False
 
     @property
     def first(self) -> list[int]:
@@ -121,23 +143,34 @@ class Parameters:
 def free_parameters(
     law: Law, free: Any, absolute: bool = False, ties: "Ties" = ()
 ) -> tuple[Parameters, list[str]]:
-    """The parameters that `free` names, but for what is tied, and notes on what was fixed instead.
+    """The parameters that `free` names, but for what is tied, and notes on what was
+    fixed instead.
 
-    `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
+    `absolute`: forces or times were measured, which show a common factor of all
+    stiffnesses.
     """
-    available, fixed = free_parameters_of(law), ""  # `fixed`: the stiffness that the note is about
+    # `fixed`: the stiffness that the note is about
+    available = free_parameters_of(law)
+    fixed = ""
     if free is DEFAULT_FREE:
         free = default_free(law, absolute)
         if "stiffness" in available and "stiffness" not in free:
             fixed = "stiffness"
     labels = _labels(law, free)  # by field: 0 is fixed, equal numbers share one value
-    if not absolute and _only_ratios(law, labels) and labels.get("stiffness", np.zeros(1)).all():
+    if (
+        not absolute
+        and _only_ratios(law, labels)
+        and labels.get("stiffness", np.zeros(1)).all()
+    ):
         shared = labels["stiffness"] == labels["stiffness"].flat[0]
         if shared.all():
             raise ValueError(
-                "Argument `free` must not hold a scalar `stiffness` (or one for all contacts): "
-                "with equal exponents a common factor of all stiffnesses changes nothing, so the "
-                "data cannot determine it. Give the law one stiffness per contact to fit their "
+                "Argument `free` must not hold a scalar `stiffness` (or one for all "
+                "contacts): "
+                "with equal exponents a common factor of all stiffnesses changes "
+                "nothing, so the "
+                "data cannot determine it. Give the law one stiffness per contact to "
+                "fit their "
                 "ratios, or free only `restitution`."
             )
         labels["stiffness"][shared] = 0
@@ -145,25 +178,40 @@ def free_parameters(
     for tie in ties:
         if tie.field in labels:
             labels[tie.field].flat[list(tie.at)] = 0
-    names, groups, start = [], [], 0  # start: the number of the first entry of a field
+    # start: the number of the first entry of a field
+    names = []
+    groups = []
+    start = 0
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
             names.append(_name(field, np.argwhere(label == value), label.size))
             groups.append(tuple((start + np.flatnonzero(label == value)).tolist()))
         start += label.size
     if not names:
-        raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
+        raise ValueError(
+            "Argument `free` must name a parameter to fit, but leaves none free."
+        )
     log = np.array([domain_of(law, entry_of(name)[0]).log for name in names])
-    note = f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
+    note = (
+        f"{fixed} is fixed at its start: with equal exponents only stiffness "
+        f"ratios "
+        f"matter."
+    )
     ratios = fixed == "stiffness[1]"
     parameters = Parameters(tuple(labels), tuple(names), tuple(groups), log, ratios)
     return parameters, [note] if fixed else []
 
 
 def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
-    """Labels by field, shaped like it: 0 for fixed entries, equal numbers for a shared value."""
-    available, labels = free_parameters_of(law), {}
-    choices = free if isinstance(free, Mapping) else dict.fromkeys(as_names("free", free), True)
+    """Labels by field, shaped like it: 0 for fixed entries, equal numbers for a shared
+    value.
+    """
+    available = free_parameters_of(law)
+    labels = {}
+    if isinstance(free, Mapping):
+        choices = free
+    else:
+        choices = dict.fromkeys(as_names("free", free), True)
     for name, choice in choices.items():
         field, entry = entry_of(name)
         if field not in available:
@@ -174,7 +222,8 @@ def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
             continue
         if not isinstance(choice, (bool, np.bool_)):
             raise ValueError(
-                f"Argument `free` must map `{name}` to True or False, but has value {choice!r}."
+                f"Argument `free` must map `{name}` to True or False, but has value "
+                f"{choice!r}."
             )
         label = labels.setdefault(field, np.zeros(shape, int))
         label.flat[places("free", name, shape)] = (label.max() + 1) * choice
@@ -182,10 +231,14 @@ def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
 
 
 def _name(field: str, members: np.ndarray, size: int) -> str:
-    """A name: restitution (all entries), restitution[2], restitution[1=3] (shared), matrix[1,2]."""
+    """A name: restitution (all entries), restitution[2], restitution[1=3] (shared),
+    matrix[1,2].
+    """
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
-    return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
+    return (
+        f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
+    )
 
 
 def as_names(argument: str, names: Any) -> tuple[str, ...]:
@@ -197,9 +250,11 @@ def as_names(argument: str, names: Any) -> tuple[str, ...]:
 
 
 def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
-    """The fields that are fitted by default: restitution, stiffness, matrix, speed; or else all.
+    """The fields that are fitted by default: restitution, stiffness, matrix, speed; or
+    else all.
 
-    A single stiffness of which only ratios matter is left out; `absolute`: see `free_parameters`.
+    A single stiffness of which only ratios matter is left out; `absolute`: see
+    `free_parameters`.
     """
     available = free_parameters_of(law)
     first = [name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in available]
@@ -215,13 +270,15 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
     name = type(plain_law(law)).__name__
     if isinstance(value_of(law, field), (float, tuple)):
         return (
-            f"Argument `free` must not hold `{field}`: it is a fixed number of this {name}; "
+            f"Argument `free` must not hold `{field}`: it is a fixed number of this "
+            f"{name}; "
             f"give {field}=jnp.asarray(...) to the law to make it a parameter."
         )
     declared = declarations_of(type(law))
     if isinstance(declared.get(field), Domain):
         return (
-            f"Argument `free` must not hold `{field}`, because this {name} has none: give it one."
+            f"Argument `free` must not hold `{field}`, because this {name} has "
+            f"none: give it one."
         )
     words = suggestion(field, declared, ABBREVIATIONS) or suggestion(field, known)
     return (
@@ -231,11 +288,14 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
 
 
 def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Integers shaped like the field: 0 is fixed, entries with equal numbers share one value."""
+    """Integers shaped like the field: 0 is fixed, entries with equal numbers share one
+    value.
+    """
     mask = np.asarray(choice)
     if mask.dtype.kind not in "biu" or (mask < 0).any():
         raise ValueError(
-            f"Argument `free` must map `{field}` to True, False, a boolean mask or numbers of "
+            f"Argument `free` must map `{field}` to True, False, a boolean mask or "
+            f"numbers of "
             f"groups (0 is fixed), but has value {choice!r}."
         )
     if mask.shape not in ((), shape):
@@ -243,9 +303,13 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
         advice = ""
         if shape == ():
             kind = "one value for all contacts"
-            advice = f" For one value each, give the law {mask.size} of them, `{field}=[...]`."
+            advice = (
+                f" For one value each, give the law {mask.size} of them, "
+                f"`{field}=[...]`."
+            )
         raise ValueError(
-            f"Argument `free` must have a mask of shape {shape} for `{field}`, which is {kind} "
+            f"Argument `free` must have a mask of shape {shape} for `{field}`, which "
+            f"is {kind} "
             f"in this law, but has a mask of shape {mask.shape}.{advice}"
         )
     if mask.dtype == bool:  # each free entry is a group of its own
@@ -255,12 +319,15 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
-    """True where a common factor of all stiffnesses changes nothing, whatever is fitted of them."""
+    """True where a common factor of all stiffnesses changes nothing, whatever is fitted
+    of them.
+    """
     stay_equal = "exponent" not in labels or len(set(labels["exponent"].flat)) == 1
     return law.only_stiffness_ratios and stay_equal
 
 
-# ---------------------------------------------------------------------------- bounds and priors
+# ---------------------------------------------------------------------------- bounds
+# and priors
 
 
 def _check_name(argument: str, name: str, known: Any) -> None:
@@ -273,13 +340,19 @@ def _check_name(argument: str, name: str, known: Any) -> None:
         )
 
 
-def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None) -> Limits:
-    """Bounds (P,), (P,): the user's, else the field's domain; the narrowest of a shared value."""
-    chosen, fields = dict(bounds or {}), sorted(set(parameters.of_fields))
+def bounds_of(
+    parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
+) -> Limits:
+    """Bounds (P,), (P,): the user's, else the field's domain; the narrowest of a shared
+    value.
+    """
+    chosen = dict(bounds or {})
+    fields = sorted(set(parameters.of_fields))
     for name in chosen:
         _check_name("bounds", entry_of(name)[0], fields)
     ends = {field: _default_bounds(law, field) for field in parameters.fields}
-    for name in sorted(chosen, key=lambda name: entry_of(name)[1] is not None):  # fields first
+    # fields first
+    for name in sorted(chosen, key=lambda name: entry_of(name)[1] is not None):
         field, _ = entry_of(name)
         at = places("bounds", name, np.shape(value_of(law, field)))
         ends[field][:, at] = np.array(_bound_pair(field, chosen[name], law))[:, at]
@@ -297,8 +370,11 @@ def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
 
 
 def _default_bounds(law: Law, field: str) -> np.ndarray:
-    """Default bounds (2, size) of a field: its domain, of a stiffness `LOG_RANGE` to each side."""
-    values, domain = np.ravel(np.asarray(value_of(law, field), float)), domain_of(law, field)
+    """Default bounds (2, size) of a field: its domain, of a stiffness `LOG_RANGE` to
+    each side.
+    """
+    values = np.ravel(np.asarray(value_of(law, field), float))
+    domain = domain_of(law, field)
     if domain.log:
         return np.stack([values / LOG_RANGE, values * LOG_RANGE])
     low, high = domain.bounds
@@ -310,28 +386,37 @@ def _bound_pair(field: str, pair: Any, law: Law) -> Limits:
     """Bounds of a field, flattened; each end is a scalar or shaped like the field."""
     shape = np.shape(value_of(law, field))
     try:
-        low, high = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in pair)
+        low, high = (
+            np.broadcast_to(np.asarray(end, float), shape).ravel() for end in pair
+        )
     except (TypeError, ValueError):
         raise ValueError(
-            f"Argument `bounds` must map `{field}` to (low, high), each a number or of shape "
+            f"Argument `bounds` must map `{field}` to (low, high), each a number or of "
+            f"shape "
             f"{shape}, but has {pair!r}."
         ) from None
     domain = domain_of(law, field)
     smallest, largest = domain.bounds
     if not (low < high).all():
-        raise ValueError(f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}.")
+        raise ValueError(
+            f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}."
+        )
     if (low < smallest).any() or (high > largest).any():
         raise ValueError(
             f"Argument `bounds` must lie in [{smallest:g}, {largest:g}] for `{field}`, "
             f"but has {pair!r}."
         )
     if domain.log and (low <= 0).any():
-        raise ValueError(f"Argument `bounds` must be > 0 for `{field}`, but has {pair!r}.")
+        raise ValueError(
+            f"Argument `bounds` must be > 0 for `{field}`, but has {pair!r}."
+        )
     return low, high
 
 
 class Prior(NamedTuple):
-    """A normal distribution of a parameter (by its index) that is known besides the data."""
+    """A normal distribution of a parameter (by its index) that is known besides the
+    data.
+    """
 
     parameter: int
     mean: float
@@ -341,32 +426,44 @@ class Prior(NamedTuple):
 def priors_of(
     parameters: Parameters, limits: Limits, priors: Mapping[str, Any] | None
 ) -> tuple[Prior, ...]:
-    """The user's priors, by name of a parameter or of a field for all that belong to it."""
-    chosen, fields = dict(priors or {}), parameters.of_fields
+    """The user's priors, by name of a parameter or of a field for all that belong to
+    it.
+    """
+    chosen = dict(priors or {})
+    fields = parameters.of_fields
     for name in chosen:
         _check_name("priors", name, (*parameters.names, *fields))
-    pairs = [chosen.get(name, chosen.get(field)) for name, field in zip(parameters.names, fields)]
+    pairs = [
+        chosen.get(name, chosen.get(field))
+        for name, field in zip(parameters.names, fields)
+    ]
     each = enumerate(zip(parameters.names, pairs, *limits))
     return tuple(Prior(i, *mean_and_std(*row)) for i, row in each if row[1] is not None)
 
 
 def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
     """The two numbers of a prior: (mean, std), or of a `ji.Normal`."""
-    ends = (pair.mean, pair.std) if hasattr(pair, "std") and hasattr(pair, "mean") else pair
+    if hasattr(pair, "std") and hasattr(pair, "mean"):
+        ends = (pair.mean, pair.std)
+    else:
+        ends = pair
     try:
         mean, std = (float(end) for end in ends)
     except (TypeError, ValueError):
         raise ValueError(
-            f"Argument `priors` must map `{name}` to (mean, standard deviation) or a ji.Normal, "
+            f"Argument `priors` must map `{name}` to (mean, standard deviation) or a "
+            f"ji.Normal, "
             f"but has {pair!r}."
         ) from None
     if not (0 < std < np.inf):
         raise ValueError(
-            f"Argument `priors` must have a standard deviation > 0 for `{name}`, but has {pair!r}."
+            f"Argument `priors` must have a standard deviation > 0 for `{name}`, but "
+            f"has {pair!r}."
         )
     if not low <= mean <= high:
         raise ValueError(
-            f"Argument `priors` must have its mean in [{low:g}, {high:g}] for `{name}`, but has "
+            f"Argument `priors` must have its mean in [{low:g}, {high:g}] for "
+            f"`{name}`, but has "
             f"{pair!r}."
         )
     return mean, std
@@ -376,7 +473,9 @@ def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, 
 
 
 class Tie(NamedTuple):
-    """A constraint: the entries `at` of a flattened field are a function of other values."""
+    """A constraint: the entries `at` of a flattened field are a function of other
+    values.
+    """
 
     name: str
     field: str
@@ -392,24 +491,33 @@ Ties = tuple[Tie, ...]
 
 
 class Values:
-    """The argument of a tie's function: values of a law by name, those that are tied included."""
+    """The argument of a tie's function: values of a law by name, those that are tied
+    included.
+    """
 
     def __init__(self, law: Law, ties: Ties):
-        self.law, self.ties = law, ties
-        self.waiting: list[str] = []  # ties being evaluated, each needed by the one before
+        self.law = law
+        self.ties = ties
+        # ties being evaluated, each needed by the one before
+        self.waiting: list[str] = []
 
     def __getitem__(self, name: str) -> Any:
         """The value of an entry, or of a whole field in its shape."""
         field, entry = entry_of(name)
         value = _value(self.law, name)
-        at, flat = places("ties", name, value.shape), value.ravel()
+        at = places("ties", name, value.shape)
+        flat = value.ravel()
         for tie in self.ties:
             if tie.overlaps(field, at):
                 flat = flat.at[np.array(tie.at)].set(self._follow(tie))
-        return flat.reshape(value.shape) if entry is None else flat[at[0]]
+        if entry is None:
+            return flat.reshape(value.shape)
+        return flat[at[0]]
 
     def _follow(self, tie: Tie) -> Any:
-        """The value of a tie's function, flattened; it evaluates other ties that it needs."""
+        """The value of a tie's function, flattened; it evaluates other ties that it
+        needs.
+        """
         if tie.name in self.waiting:
             circle = [*self.waiting[self.waiting.index(tie.name) :], tie.name]
             way = f"{circle[0]} needs {', which needs '.join(circle[1:])}"
@@ -420,12 +528,17 @@ class Values:
         self.waiting.pop()
         allowed = {(), old.shape if tie.name == tie.field else ()}
         if value.shape not in allowed:
-            or_shape = f" or shape {old.shape}" if len(allowed) > 1 else ""
+            if len(allowed) > 1:
+                or_shape = f" or shape {old.shape}"
+            else:
+                or_shape = ""
             raise ValueError(
                 f"Argument `ties` must give one number for `{tie.name}`{or_shape}, "
                 f"but its function gives shape {value.shape}."
             )
-        return value.ravel() if value.ndim else value
+        if value.ndim:
+            return value.ravel()
+        return value
 
 
 def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
@@ -437,12 +550,15 @@ def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
 
 
 def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
-    """The user's ties, checked, with their functions evaluated at the law's start values."""
+    """The user's ties, checked, with their functions evaluated at the law's start
+    values.
+    """
     checked: Ties = ()
     for name, function in (ties or {}).items():
         if not callable(function):
             raise ValueError(
-                f"Argument `ties` must map `{name}` to a function of the other values, as in "
+                f"Argument `ties` must map `{name}` to a function of the other values, "
+                f"as in "
                 f"lambda p: 2 * p['restitution'], but has {function!r}."
             )
         at = tuple(places("ties", name, _value(law, name).shape))
@@ -450,16 +566,19 @@ def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
         for other in checked:
             if other.overlaps(tie.field, at):
                 raise ValueError(
-                    f"Argument `ties` must tie an entry once, but {other.name} and {name} overlap."
+                    f"Argument `ties` must tie an entry once, but {other.name} and "
+                    f"{name} overlap."
                 )
         checked = (*checked, tie)
     start = tied(law, checked)
     for tie in checked:
-        value, domain = tied_value(start, tie), domain_of(start, tie.field)
+        value = tied_value(start, tie)
+        domain = domain_of(start, tie.field)
         if not bool(np.asarray(domain.holds(value))):
             low, high = domain.bounds
             raise ValueError(
-                f"Argument `ties` must keep `{tie.name}` in [{low:g}, {high:g}], but its function "
+                f"Argument `ties` must keep `{tie.name}` in [{low:g}, {high:g}], but "
+                f"its function "
                 f"gives {value.tolist()} at the start."
             )
     return checked
@@ -476,14 +595,20 @@ def tied_names(law: Law, ties: Ties) -> list[str]:
     for tie in ties:
         shape = np.shape(value_of(law, tie.field))
         is_array = tie.name == tie.field and shape  # of which each entry has a name
-        members = [np.array([np.unravel_index(i, shape)]) for i in tie.at] if is_array else []
+        if is_array:
+            members = [np.array([np.unravel_index(i, shape)]) for i in tie.at]
+        else:
+            members = []
         names += [_name(tie.field, each, 0) for each in members] or [tie.name]
     return names
 
 
 def _value(law: Law, name: str) -> Any:
-    """The value of the field that `name` belongs to; a ValueError unless it is a parameter."""
-    available, (field, _) = free_parameters_of(law), entry_of(name)
+    """The value of the field that `name` belongs to; a ValueError unless it is a
+    parameter.
+    """
+    available = free_parameters_of(law)
+    field, _ = entry_of(name)
     if field not in available:
         raise ValueError(
             f"Argument `ties` must use parameters of {type(law).__name__}, one of "
@@ -492,18 +617,22 @@ def _value(law: Law, name: str) -> Any:
     return jnp.asarray(available[field].value)
 
 
-# ---------------------------------------------------------------------------- parts of a scene
+# ---------------------------------------------------------------------------- parts of
+# a scene
 
 
 @forwards_to_law
 class LawInScene(Law):
-    """A law, and the parts of the scene that are fitted with it; None: as the scene has them.
+    """A law, and the parts of the scene that are fitted with it; None: as the scene has
+    them.
 
     A tilt by a turns the contact: `N cos(a) + H sin(a)`, `H cos(a) - N sin(a)`.
     """
 
     law: Law
-    mass: OptionalValues = parameter(low=0.0, open_low=True, per_contact=False, default=None)
+    mass: OptionalValues = parameter(
+        low=0.0, open_low=True, per_contact=False, default=None
+    )
     gaps: OptionalValues = parameter(low=0.0, default=None)
     tilt: OptionalValues = parameter(low=-np.pi, high=np.pi, default=None)
 
@@ -519,9 +648,11 @@ class LawInScene(Law):
             scene = with_gaps(scene, self.gaps)
         if self.tilt is None:
             return scene
-        normals, tangents = scene.normals, scene.tangents
+        normals = scene.normals
+        tangents = scene.tangents
         assert tangents is not None
-        cos, sin = jnp.cos(self.tilt)[None, :], jnp.sin(self.tilt)[None, :]
+        cos = jnp.cos(self.tilt)[None, :]
+        sin = jnp.sin(self.tilt)[None, :]
         turned = (normals * cos + tangents * sin, tangents * cos - normals * sin)
         return eqx.tree_at(lambda s: (s._normals, s.tangents), scene, turned)
 
@@ -535,33 +666,49 @@ def placed(law: Law, scenes: Scene) -> tuple[Law, Scene]:
 
 def plain_law(law: Any) -> Any:
     """The law without parts of a scene or a motion."""
-    return law.law if isinstance(law, LawInScene | LawInMotion) else law
+    if isinstance(law, LawInScene | LawInMotion):
+        return law.law
+    return law
 
 
-def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: Any) -> Law:
-    """The law with the parts of the scene that `free` names; `own_scenes`: each shot has its own.
+def with_parts_of_scene(
+    law: Law, scene: Scene | None, own_scenes: bool, free: Any
+) -> Law:
+    """The law with the parts of the scene that `free` names; `own_scenes`: each shot
+    has its own.
 
     Raises:
         ValueError: parts that the scene does not have, or that the shots do not share.
     """
     wanted = {entry_of(name)[0] for name in as_names("free", free)} & set(OF_A_SCENE)
-    parts = [name for name in OF_A_SCENE if name in wanted - set(free_parameters_of(law))]
+    parts = [
+        name for name in OF_A_SCENE if name in wanted - set(free_parameters_of(law))
+    ]
     if not parts or isinstance(law, LawInScene):
         return law
     if scene is None or own_scenes:
         raise ValueError(
-            f"Argument `free` may name `{parts[0]}` only where all shots have one `scene`, but "
+            f"Argument `free` may name `{parts[0]}` only where all shots have one "
+            f"`scene`, but "
             "they have scenes of their own."
         )
     if isinstance(law, RestitutionMatrix):
         raise ValueError(
-            f"Argument `free` must not name `{parts[0]}` with a RestitutionMatrix, which is "
+            f"Argument `free` must not name `{parts[0]}` with a RestitutionMatrix, "
+            f"which is "
             "admissible in one scene only."
         )
     planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
-    flat = jnp.zeros(scene.contacts, scene.mass.dtype) if planar else None
-    mass = scene.mass if scene.mass.ndim == 1 else None
-    values = {  # the part of the scene, None: it has none that could be fitted; what it must have
+    if planar:
+        flat = jnp.zeros(scene.contacts, scene.mass.dtype)
+    else:
+        flat = None
+    if scene.mass.ndim == 1:
+        mass = scene.mass
+    else:
+        mass = None
+    # the part of the scene, None: it has none that could be fitted; what it must have
+    values = {
         "mass": (mass, "that of `scene` is (n,)"),
         "gaps": (scene.gaps, "`scene` has gaps"),
         "tilt": (flat, "`scene` has one tangent for each contact"),
@@ -576,7 +723,8 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
 def limits_with_scene(
     parameters: Parameters, law: LawInScene, limits: Limits, priors: tuple[Prior, ...]
 ) -> Limits:
-    """Limits of all parameters; parts of the scene stay within `REACH` deviations of their priors.
+    """Limits of all parameters; parts of the scene stay within `REACH` deviations of
+    their priors.
 
     Raises:
         ValueError: a part of the scene without a prior, or far from it at the start.
@@ -589,14 +737,20 @@ def limits_with_scene(
             continue
         if i not in prior_of:
             raise ValueError(
-                f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
+                f"Argument `priors` must have (mean, standard deviation) for `{name}`, "
+                f"a part of "
                 "the scene that is fitted with the law."
             )
         _, mean, std = prior_of[i]
-        low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
+        low[i], high[i] = (
+            max(low[i], mean - REACH * std),
+            min(high[i], mean + REACH * std),
+        )
         if not low[i] <= start[i] <= high[i]:
             raise ValueError(
-                f"Argument `priors` must have a mean for `{name}` within {REACH:g} standard "
-                f"deviations of its value in the scene, {start[i]:g}, but has {mean:g} ± {std:g}."
+                f"Argument `priors` must have a mean for `{name}` within {REACH:g} "
+                f"standard "
+                f"deviations of its value in the scene, {start[i]:g}, but has {mean:g} "
+                f"± {std:g}."
             )
     return low, high

@@ -11,7 +11,15 @@ from scipy.special import chdtri, ndtri
 
 from jimpact.fits.intervals import Profile
 from jimpact.fits.report import Fit
-from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled, write
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    SMALL,
+    new_figure,
+    new_panels,
+    styled,
+    write,
+)
 from jimpact.tools.checks import check_choice, check_kind
 
 _TITLE = 45  # letters of a line of a panel's title
@@ -39,7 +47,9 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         TypeError: something else than profiles.
 
     >>> import jimpact as ji
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> data = ji.Experiments(
+    ...     [[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02
+    ... )
     >>> fit = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
     >>> len(ji.plot.profiles(ji.profile(fit)).axes)
     1
@@ -71,7 +81,7 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
 
 @styled(Fit)
 def correlation(fit: Fit) -> Figure:
-    """Correlations of the parameters' errors; empty where the data cannot see one of them.
+    """Correlations of the parameters' errors; empty where the data see none.
 
     Args:
         fit: of several parameters.
@@ -84,7 +94,9 @@ def correlation(fit: Fit) -> Figure:
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.97], sigma=0.02)
-    >>> result = ji.fit(ji.LZB(0.9, [1.0, 2.0]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
+    >>> result = ji.fit(
+    ...     ji.LZB(0.9, [1.0, 2.0]), ji.chain([1.0, 1.0, 1.0]), data, starts=1
+    ... )
     >>> len(ji.plot.correlation(result).axes)
     2
     """
@@ -97,7 +109,10 @@ def correlation(fit: Fit) -> Figure:
     axes.set_yticks(range(count), fit.names)
     if count <= 8:  # numbers fit into the cells, white on dark ones
         for i, j in np.argwhere(np.isfinite(fit.correlation)):
-            colour = "white" if abs(fit.correlation[i, j]) > 0.6 else "black"
+            if abs(fit.correlation[i, j]) > 0.6:
+                colour = "white"
+            else:
+                colour = "black"
             write(axes, (j, i), f"{fit.correlation[i, j]:.2f}", color=colour)
     figure.colorbar(image, ax=axes, shrink=0.8, label="correlation")
     return figure
@@ -105,10 +120,10 @@ def correlation(fit: Fit) -> Figure:
 
 @styled(Fit)
 def residuals(fit: Fit) -> Figure:
-    """Measured against fitted; residuals in standard errors over the speed, and their quantiles.
+    """Measured against fitted; residuals over the speed, and their quantiles.
 
-    Without sigma the standard error is the estimated noise. What the law explains leaves no trend
-    over the speed, and normal noise lies on the straight line.
+    Without sigma the standard error is the estimated noise. What the law explains
+    leaves no trend over the speed, and normal noise lies on the straight line.
 
     Args:
         fit: of shots, or of anything else that was measured.
@@ -132,13 +147,23 @@ def residuals(fit: Fit) -> Figure:
     noise = np.broadcast_to(sigma, measured.shape)[is_measured]
     known = np.isfinite(noise).all() and (noise > 0).all()
     scaled = fit.residual[is_measured] / (noise if known else 1.0)
-    unit = "standard errors" if known else "as measured"
+    if known:
+        unit = "standard errors"
+    else:
+        unit = "as measured"
     figure, (first, second, third) = new_panels(3, 3.0)
     units = [] if fit.experiments is None else dict.fromkeys(fit.experiments.units)
-    values = f" [{', '.join(units)}]" if units else ""
+    if units:
+        values = f" [{', '.join(units)}]"
+    else:
+        values = ""
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
-    first.axline((float(measured[is_measured].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
-    first.plot(fit.predicted[is_measured], measured[is_measured], color=COLOURS[0], **style)
+    first.axline(
+        (float(measured[is_measured].mean()),) * 2, slope=1.0, color=GREY, lw=0.8
+    )
+    first.plot(
+        fit.predicted[is_measured], measured[is_measured], color=COLOURS[0], **style
+    )
     first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
     over, label = _residual_axis(fit)
     second.axhline(0, color=GREY, lw=0.8)
@@ -146,9 +171,12 @@ def residuals(fit: Fit) -> Figure:
     second.plot(abscissa, scaled, color=COLOURS[0], **style)
     second.set(xlabel=label, ylabel=f"residual [{unit}]")
     ordered = np.sort(scaled)
-    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))  # expected of normal noise
+    # expected of normal noise
+    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
     third.plot(normal, ordered, color=COLOURS[0], **style)
-    third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
+    third.axline(
+        (0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY
+    )
     third.set(xlabel="normal quantile [standard errors]", ylabel=f"residual [{unit}]")
     if known:
         for y in (-_TWO_SIDED, _TWO_SIDED):
@@ -161,7 +189,8 @@ def _residual_axis(fit: Fit) -> tuple[np.ndarray, str]:
 
     The fastest approach (K, 1) [m/s] of K shots; of other data the fitted values.
     """
-    data, scene = fit.experiments, fit.problem.scene
+    data = fit.experiments
+    scene = fit.problem.scene
     if data is None:
         return np.asarray(fit.predicted), "fitted"
     return data.approach_speed(scene)[:, None], "fastest approach [m/s]"
@@ -169,14 +198,15 @@ def _residual_axis(fit: Fit) -> tuple[np.ndarray, str]:
 
 @styled(Fit)
 def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> Figure:
-    """Every parameter, and every pair of them: intervals and regions of the fit, or of draws.
+    """Every parameter and every pair: intervals and regions of the fit, or draws.
 
-    Lines are the normal density of each parameter and the ellipses in which two of them lie with
-    68 and 95 %, from values and covariance; draws are histograms and points.
+    Lines are the normal density of each parameter and the ellipses in which two of them
+    lie with 68 and 95 %, from values and covariance; draws are histograms and points.
 
     Args:
         fit: with standard errors; what the data do not determine is left out.
-        draws: of the parameters: `ji.bootstrap(fit)`, `ji.posterior(fit)`, or an array (N, P).
+        draws: of the parameters: `ji.bootstrap(fit)`, `ji.posterior(fit)`, or an array
+            (N, P).
         names: of the parameters to show, at most `MOST`; None: the first ones.
 
     Returns:
@@ -184,12 +214,15 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
 
     Raises:
         TypeError: no fit.
-        ValueError: unknown names; no standard error is known; draws of other parameters.
+        ValueError: unknown names; no standard error is known; draws of other
+            parameters.
 
     >>> import jimpact as ji
     >>> after = [[0.1, 0.2, 0.7], [-0.6, -0.3, -0.1]]
     >>> data = ji.Experiments([[1.0, 0, 0], [0, 0, -1.0]], after, sigma=0.02)
-    >>> result = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
+    >>> result = ji.fit(
+    ...     ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data, starts=1
+    ... )
     >>> len(ji.plot.corner(result).axes)
     3
     """
@@ -199,8 +232,13 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     usable = np.flatnonzero(known).tolist()
     shown = [i for i in usable if names is None or fit.names[i] in names][:MOST]
     if not shown:
-        raise ValueError("Argument `fit` must have a standard error to show, but has none.")
-    values = None if draws is None else _draws_of(fit, draws)
+        raise ValueError(
+            "Argument `fit` must have a standard error to show, but has none."
+        )
+    if draws is None:
+        values = None
+    else:
+        values = _draws_of(fit, draws)
     count = len(shown)
     height = float(np.clip(1.6 * count + 0.8, 3.0, 7.2))
     figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
@@ -218,25 +256,30 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
 
 
 def _draws_of(fit: Fit, draws: Any) -> np.ndarray:
-    """Draws (N, P) of a fit's P parameters, from an array, a bootstrap or ArviZ's posterior."""
+    """Draws (N, P) of a fit's P parameters, from an array, a bootstrap or ArviZ's
+    posterior.
+    """
     if hasattr(draws, "posterior"):
         columns = [np.ravel(draws.posterior[name]) for name in fit.names]
         return np.stack(columns, axis=1)
     values = np.asarray(getattr(draws, "value", draws), float)
     if values.ndim != 2 or values.shape[1] != len(fit.names):
         raise ValueError(
-            f"Argument `draws` must have shape (N, {len(fit.names)}), parameters of the fit, but "
+            f"Argument `draws` must have shape (N, {len(fit.names)}), parameters of "
+            f"the fit, but "
             f"has shape {values.shape}."
         )
     return values
 
 
 def _draw_density(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
-    """Draw the normal density of parameter i from value and standard error; draws: a histogram.
+    """Draw the normal density of parameter i from value and standard error; draws: a
+    histogram.
 
     `values` are draws (N, P) of all parameters, if any.
     """
-    z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
+    z = np.linspace(-_WIDE, _WIDE, 121)
+    error = fit.standard_error[i]
     density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:
         axes.hist(values[:, i], bins="auto", density=True, color=COLOURS[4], alpha=0.5)
@@ -244,11 +287,15 @@ def _draw_density(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> No
     axes.set_yticks([])
 
 
-def _draw_ellipses(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
-    """Draw the ellipses in which parameters i and j lie with 68 and 95 %; draws: points.
+def _draw_ellipses(
+    axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None
+) -> None:
+    """Draw the ellipses in which parameters i and j lie with 68 and 95 %; draws:
+    points.
 
-    Equation: `(x - x_fit)^T C^-1 (x - x_fit) = chi^2`, C their covariance and chi^2 the quantile
-    of two degrees of freedom; on it `x = x_fit + sqrt(chi^2) L (cos a, sin a)`, `L L^T = C`.
+    Equation: `(x - x_fit)^T C^-1 (x - x_fit) = chi^2`, C their covariance and chi^2 the
+    quantile of two degrees of freedom; on it
+    `x = x_fit + sqrt(chi^2) L (cos a, sin a)`, `L L^T = C`.
     """
     if values is not None:
         axes.plot(values[:, i], values[:, j], ".", ms=2, color=COLOURS[4], alpha=0.5)
@@ -257,5 +304,7 @@ def _draw_ellipses(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | No
     circle = np.stack([np.cos(angle), np.sin(angle)])
     for share in _SHARES:
         edge = np.sqrt(chdtri(2, 1 - share)) * factor @ circle
-        axes.plot(fit.value[i] + edge[0], fit.value[j] + edge[1], color=COLOURS[0], lw=1.2)
+        axes.plot(
+            fit.value[i] + edge[0], fit.value[j] + edge[1], color=COLOURS[0], lw=1.2
+        )
     axes.plot(fit.value[i], fit.value[j], "+", color="black", ms=7)

@@ -1,4 +1,6 @@
-"""A fit as text (verdict, parameters, quality, minima, warnings, shots), as data, and in a file."""
+"""A fit as text (verdict, parameters, quality, minima, warnings, shots), as data, and
+in a file.
+"""
 
 import dataclasses
 import itertools
@@ -22,18 +24,26 @@ from jimpact.tools.checks import check_kind
 from jimpact.tools.records import as_data, counted, degrees, formatted, with_error
 from jimpact.tools.status import STATUS
 
-_ZERO = 1e-12  # parameters in whatever unit that are printed as 0: rounding, as minima end in it
-_ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
+# parameters in whatever unit that are printed as 0: rounding, as minima end in it
+_ZERO = 1e-12
+# share of the largest velocity that is printed as 0: impacts are good to 1e-8
+_ROUNDING = 1e-7
 _VELOCITIES_SHOWN = 24  # in the table of shots
-# Correlations of two parameters from this size on are printed, as lmfit does; ten times more: none.
+# Correlations of two parameters from this size on are printed, as lmfit does; ten times
+# more: none.
 _CORRELATED = 0.1
 _CORRELATIONS_SHOWN = 6  # the largest ones; 10 parameters have 45
 _MINIMA_SHOWN = 5  # in the list of minima, the lowest first
 _PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
 # each contact may have its own
-OF_A_CONTACT = ("restitution", "friction", "tangential_restitution", "tangential_stiffness")
-# Degrees of freedom up to which intervals are visibly wider than two standard errors: with ten
-# times more they are wider by 2 %.
+OF_A_CONTACT = (
+    "restitution",
+    "friction",
+    "tangential_restitution",
+    "tangential_stiffness",
+)
+# Degrees of freedom up to which intervals are visibly wider than two standard errors:
+# with ten times more they are wider by 2 %.
 FEW_DEGREES = 8
 UNSEEN = "start value; not determined by the data"  # note on a value in brackets
 FORMAT = 1  # of the file; it changes where older files could not be read any more
@@ -46,19 +56,30 @@ def joined_words(parts: Sequence[str]) -> str:
     >>> joined_words(["a"]), joined_words(["a", "b", "c"])
     ('a', 'a, b and c')
     """
-    return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)
+    if len(parts) > 1:
+        return " and ".join([", ".join(parts[:-1]), parts[-1]])
+    return "".join(parts)
 
 
 def _values_in_words(fit: "Fit") -> str:
-    """Part of a sentence: values with errors, what they assume, what the data do not determine."""
-    seen, data = fit.determined, _data_name(fit)
+    """Part of a sentence: values with errors, what they assume, what the data do not
+    determine.
+    """
+    seen = fit.determined
+    data = _data_name(fit)
     determined = np.flatnonzero(seen)
     others = " and ".join(_full_name(fit, int(i)) for i in np.flatnonzero(~seen))
     parts = [_with_error(fit, int(i)) for i in determined]
     if len(parts) > _PARAMETERS_NAMED:
         worst = int(np.argmax(np.nan_to_num(fit.standard_error[determined])))
-        parts = [f"{len(parts)} parameters are fitted, the least certain {parts[worst]}"]
-    priors = {name: _prior(fit, i) for i, name in enumerate(fit.names) if not fit.from_prior[i]}
+        parts = [
+            f"{len(parts)} parameters are fitted, the least certain {parts[worst]}"
+        ]
+    priors = {
+        name: _prior(fit, i)
+        for i, name in enumerate(fit.names)
+        if not fit.from_prior[i]
+    }
     assumed = _assumptions(fit)
     assumed += [f"the {prior} of {name}" for name, prior in priors.items() if prior]
     if parts and assumed:
@@ -71,7 +92,9 @@ def _values_in_words(fit: "Fit") -> str:
 
 
 def _objection(fit: "Fit") -> str:
-    """An objection to the law, as a verb phrase: it does not fit, or fails in shots; else ''."""
+    """An objection to the law, as a verb phrase: it does not fit, or fails in shots;
+    else ''.
+    """
     data = _data_name(fit)
     if fit.shows_lack_of_fit:
         return f"does not fit {data}"
@@ -87,21 +110,30 @@ def _objection(fit: "Fit") -> str:
 
 
 def _assumptions(fit: "Fit") -> list[str]:
-    """Assumptions on several contacts, as phrases: common values, stiffnesses, exponents."""
+    """Assumptions on several contacts, as phrases: common values, stiffnesses,
+    exponents.
+    """
     if fit.experiments is None:
         return []
-    law, fitted = fit.problem.law, set(fit.problem.parameters.fields)
+    law = fit.problem.law
+    fitted = set(fit.problem.parameters.fields)
     contacts = fit.experiments.largest_scene(fit.problem.scene).contacts
     if contacts < 2:
         return []
     each = f"{'both' if contacts == 2 else f'all {contacts}'} contacts"
     assumed = [f"one {name} for {each}" for name in fit.names if name in OF_A_CONTACT]
-    for name, words in (("stiffness", "equal stiffnesses"), ("exponent", "the exponent {:g}")):
+    for name, words in (
+        ("stiffness", "equal stiffnesses"),
+        ("exponent", "the exponent {:g}"),
+    ):
         value = value_of(law, name)
         if value is None or name in fitted:
             continue
         values = np.unique(np.asarray(value, float))
-        kinds = {1.5: " (Hertz)", 1.0: " (linear)"} if name == "exponent" else {}
+        if name == "exponent":
+            kinds = {1.5: " (Hertz)", 1.0: " (linear)"}
+        else:
+            kinds = {}
         same = words.format(values[0]) + kinds.get(values[0], "")
         assumed.append(same if len(values) == 1 else f"the {name} of each contact")
     return assumed
@@ -111,38 +143,60 @@ def _data_name(fit: "Fit") -> str:
     """A noun for the data: "these data", "this shot", or "these 4 shots"."""
     if fit.experiments is None:
         return "these data"
-    return "this shot" if fit.shot_count == 1 else f"these {fit.shot_count} shots"
+    if fit.shot_count == 1:
+        return "this shot"
+    return f"these {fit.shot_count} shots"
 
 
 def _full_name(fit: "Fit", i: int) -> str:
     """The name of a parameter; a stiffness is a ratio if that of contact 1 is fixed."""
     name = fit.names[i]
     ratio = name.startswith("stiffness[") and fit.problem.parameters.ratios
-    return f"the stiffness ratio {name} / stiffness[1]" if ratio else name
+    if ratio:
+        return f"the stiffness ratio {name} / stiffness[1]"
+    return name
 
 
 def _with_error(fit: "Fit", i: int) -> str:
-    """Text of parameter i: value and error; its profile's interval if one-sided or in pieces."""
-    value, error, name = fit.value[i], fit.standard_error[i], _full_name(fit, i)
+    """Text of parameter i: value and error; its profile's interval if one-sided or in
+    pieces.
+    """
+    value = fit.value[i]
+    error = fit.standard_error[i]
+    name = _full_name(fit, i)
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
-    text = f"{name} = {value:g}" if fit.at_bound[i] else f"{name} = {with_error(value, error)}"
+    if fit.at_bound[i]:
+        text = f"{name} = {value:g}"
+    else:
+        text = f"{name} = {with_error(value, error)}"
     if fit.from_prior[i]:
         return f"{text}, which is its prior"
-    profile = fit.profiles[i] if fit.profiles else None
-    if profile and profile.determines and (any(profile.open_ends) or len(profile.intervals) > 1):
+    if fit.profiles:
+        profile = fit.profiles[i]
+    else:
+        profile = None
+    if (
+        profile
+        and profile.determines
+        and (any(profile.open_ends) or len(profile.intervals) > 1)
+    ):
         return f"{text}, {profile.words} ({100 * profile.level:g} %)"
     return f"{text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 
 def _headline(fit: "Fit") -> str:
     """First line of the report: the law, the number of measured values, the method."""
-    measured, law = np.isfinite(fit.problem.measured), type(fit.law).__name__
+    measured = np.isfinite(fit.problem.measured)
+    law = type(fit.law).__name__
     values = int(measured.sum())
     if fit.experiments is None:
         return f"Fit of {law} to {values} measured values, {fit.method}"
     shots, size = fit.predicted.shape
-    count = f"{values}" if measured.all() else f"{values} of {measured.size}"
+    if measured.all():
+        count = f"{values}"
+    else:
+        count = f"{values} of {measured.size}"
     one_unit = len(set(fit.experiments.units)) == 1
     what = counted(size, *(("body", "bodies") if one_unit else ("coordinate",)))
     seen = f"{count} {'velocity' if measured.size == 1 else 'velocities'} measured"
@@ -150,10 +204,15 @@ def _headline(fit: "Fit") -> str:
 
 
 def _prior(fit: "Fit", i: int) -> str:
-    """Text of the prior of parameter i, with 'alone' where the data add nothing; '' without one."""
+    """Text of the prior of parameter i, with 'alone' where the data add nothing; ''
+    without one.
+    """
     for prior in fit.problem.priors:
         if prior.parameter == i:
-            alone = " alone" if fit.from_prior[i] else ""
+            if fit.from_prior[i]:
+                alone = " alone"
+            else:
+                alone = ""
             return f"prior{alone} {prior.mean:g} ± {prior.std:g}"
     return ""
 
@@ -161,81 +220,123 @@ def _prior(fit: "Fit", i: int) -> str:
 def marked(value: float, seen: bool, digits: str) -> str:
     """A value of a table, in brackets where the data do not determine it."""
     text = formatted(value, digits)
-    return text if seen else f"({text})"
+    if seen:
+        return text
+    return f"({text})"
 
 
 def named_values(fit: "Fit", values: np.ndarray) -> str:
-    """Names and values (P,) of the parameters, in brackets what the data do not determine."""
-    cells = zip(fit.names, np.where(np.abs(values) <= _ZERO, 0.0, values), fit.determined)
-    return ", ".join(f"{name} {marked(value, seen, '.4g')}" for name, value, seen in cells)
+    """Names and values (P,) of the parameters, in brackets what the data do not
+    determine.
+    """
+    cells = zip(
+        fit.names, np.where(np.abs(values) <= _ZERO, 0.0, values), fit.determined
+    )
+    return ", ".join(
+        f"{name} {marked(value, seen, '.4g')}" for name, value, seen in cells
+    )
 
 
 def _parameters(fit: "Fit") -> list[str]:
-    """Lines of the table of parameters: value, standard error, interval, notes; then of ties."""
+    """Lines of the table of parameters: value, standard error, interval, notes; then of
+    ties.
+    """
     width = max(9, *(len(name) for name in fit.names))
     heads = f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"
     lines = [heads + " (profile)" * bool(fit.profiles)]
     seen = fit.determined
     for i, (name, pieces) in enumerate(zip(fit.names, fit.intervals())):
         error = fit.standard_error[i]
-        error_text = "unknown" if np.isnan(error) else f"{error:.3g}"
-        error_text = "undetermined" if np.isinf(error) else error_text
+        if np.isnan(error):
+            error_text = "unknown"
+        else:
+            error_text = f"{error:.3g}"
+        if np.isinf(error):
+            error_text = "undetermined"
         interval = "-"
         if np.isfinite(error) or fit.profiles:
             interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
-        note = "at its bound" if fit.at_bound[i] else ""
+        if fit.at_bound[i]:
+            note = "at its bound"
+        else:
+            note = ""
         note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
         value = marked(fit.value[i], seen[i], ".6g")
         cells = f"{name:{width}s} {value:>12s} {error_text:>12s}   {interval}   {note}"
         lines.append(cells.rstrip())
-    lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in fit.tied.items()]
+    lines += [
+        f"{name} = {with_error(*pair)} is tied" for name, pair in fit.tied.items()
+    ]
     freedom = fit.degrees_of_freedom
     if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:
         lines.append(
-            f"With {degrees(freedom)}, a 95 % interval is {fit.quantile(0.95):.2g} standard errors "
+            f"With {degrees(freedom)}, a 95 % interval is {fit.quantile(0.95):.2g} "
+            f"standard errors "
             "to each side (Student's t), not 1.96."
         )
     if fit.linearization_misleads and not fit.profiles:
         lines.append(
-            "These intervals take the sum of squares for a parabola, which may mislead here: "
+            "These intervals take the sum of squares for a parabola, which may mislead "
+            "here: "
             "`ji.profile(fit)` does not."
         )
     return lines
 
 
 def _correlations(fit: "Fit") -> list[str]:
-    """Lines for pairs of determined parameters with correlated errors, the largest sizes first.
+    """Lines for pairs of determined parameters with correlated errors, the largest
+    sizes first.
 
     A correlation of size 1 would be a combination that the data do not determine.
     """
     pairs = itertools.combinations(np.flatnonzero(fit.determined).tolist(), 2)
     sizes = {pair: float(fit.correlation[pair]) for pair in pairs}
-    worst = sorted((x for x in sizes if abs(sizes[x]) >= _CORRELATED), key=lambda x: -abs(sizes[x]))
+    worst = sorted(
+        (x for x in sizes if abs(sizes[x]) >= _CORRELATED), key=lambda x: -abs(sizes[x])
+    )
     lines = [
         f"{fit.names[i]} and {fit.names[j]}: {sizes[i, j]:.3f}"
         for i, j in worst[:_CORRELATIONS_SHOWN]
     ]
     if len(worst) > len(lines):
         lines.append(f"... and {len(worst) - len(lines)} more, see `fit.correlation`")
-    return _section(f"Correlations (below {_CORRELATED:g} in size: not listed)", tuple(lines))
+    return _section(
+        f"Correlations (below {_CORRELATED:g} in size: not listed)", tuple(lines)
+    )
 
 
 def _quality(fit: "Fit") -> list[str]:
     """Lines on the quality of the fit: residuals, chi^2 or noise, rank, solver."""
-    unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
+    if fit.experiments is not None:
+        unit = " m/s"
+        one = "velocity"
+    else:
+        unit = ""
+        one = "value"
     exact = fit.starts[0].sum_of_squares <= fit.problem.exact_squares
-    rms = "0 (the values are reproduced)" if exact else f"{fit.rms:.4g}{unit}"
+    if exact:
+        rms = "0 (the values are reproduced)"
+    else:
+        rms = f"{fit.rms:.4g}{unit}"
     lines = [f"rms residual   {rms}"]
     if fit.problem.sigma is not None:
-        squares = f"{fit.starts[0].sum_of_squares:.4g} with {degrees(fit.degrees_of_freedom)}"
+        squares = (
+            f"{fit.starts[0].sum_of_squares:.4g} with {degrees(fit.degrees_of_freedom)}"
+        )
         lines.append(f"chi^2          {squares} (sigma given)")
         lines += _sigma_sources(fit)
         if fit.noise > 1 and fit.loss == "squares":
-            ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
+            ratio = np.sqrt(
+                fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1)
+            )
             every = np.isclose(fit.noise, ratio, rtol=1e-3)
-            part = "" if every else " (the factor is that of the residuals that are not momentum)"
+            if every:
+                part = ""
+            else:
+                part = " (the factor is that of the residuals that are not momentum)"
             lines.append(
-                f"errors         standard errors multiplied by {fit.noise:.3g}, because chi^2 "
+                f"errors         standard errors multiplied by {fit.noise:.3g}, "
+                f"because chi^2 "
                 f"contradicts the stated sigma{part}"
             )
     elif np.isfinite(fit.noise):
@@ -243,9 +344,17 @@ def _quality(fit: "Fit") -> list[str]:
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
             f"{degrees(fit.degrees_of_freedom)}"
         )
-    total, bounded = len(fit.names), int(fit.determined.sum())  # bounded by intervals
-    fewer = f"; the errors leave {total - bounded} unbounded" if bounded < fit.rank == total else ""
-    state = "converged" if fit.converged else "NOT converged"
+    # bounded by intervals
+    total = len(fit.names)
+    bounded = int(fit.determined.sum())
+    if bounded < fit.rank == total:
+        fewer = f"; the errors leave {total - bounded} unbounded"
+    else:
+        fewer = ""
+    if fit.converged:
+        state = "converged"
+    else:
+        state = "NOT converged"
     rank = f"{fit.rank} of {counted(total, 'parameter')}"
     lines.append(f"determined     {rank} (rank of the derivatives{fewer})")
     return [
@@ -255,14 +364,25 @@ def _quality(fit: "Fit") -> list[str]:
 
 
 def _sigma_sources(fit: "Fit") -> list[str]:
-    """Lines on further errors in the stated sigma: resolution, and velocities before."""
-    data, lines = fit.experiments, []
+    """Lines on further errors in the stated sigma: resolution, and velocities
+    before.
+    """
+    data = fit.experiments
+    lines = []
     if data is not None and data.resolution is not None:
         steps = np.unique(np.asarray(data.resolution)[data.measured])
-        size = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
-        lines.append(f"               with that of readings in steps of {size}: step / sqrt(12)")
+        if len(steps) == 1:
+            size = f"{steps[0]:.3g}"
+        else:
+            size = f"{steps[0]:.3g} to {steps[-1]:.3g}"
+        lines.append(
+            f"               with that of readings in steps of {size}: step / sqrt(12)"
+        )
     if data is not None and data.sigma_pre is not None:
-        errors = "their covariance with" if data.covariance is not None else "those of"
+        if data.covariance is not None:
+            errors = "their covariance with"
+        else:
+            errors = "those of"
         searched = "the velocities before, whose true values are searched for"
         lines.append(f"               with {errors} {searched}")
     return lines
@@ -270,22 +390,47 @@ def _sigma_sources(fit: "Fit") -> list[str]:
 
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
     """A titled list, a line for each entry; no lines if it is empty."""
-    return [title, *(f"  - {line}" for line in lines)] if lines else []
+    if lines:
+        return [title, *(f"  - {line}" for line in lines)]
+    return []
 
 
 def _minima(fit: "Fit") -> list[str]:
-    """Lines on the minima that starts ended in: sum of squares, number of starts, values."""
-    total, lost, count = fit.start_count, fit.lost_starts, len(fit.starts)
-    given_up = f"{lost} of {counted(total, 'start')} {'was' if lost == 1 else 'were'} given up."
-    unfinished = [given_up] if lost else []
+    """Lines on the minima that starts ended in: sum of squares, number of starts,
+    values.
+    """
+    total = fit.start_count
+    lost = fit.lost_starts
+    count = len(fit.starts)
+    given_up = (
+        f"{lost} of {counted(total, 'start')} {'was' if lost == 1 else 'were'} "
+        f"given up."
+    )
+    if lost:
+        unfinished = [given_up]
+    else:
+        unfinished = []
     if count == 1:
         ended = f"{total - lost} of {total} starts ended in this minimum."
-        return [" ".join([ended, *unfinished])] if total > 1 else []
-    where = f"{count} minima" if fit.rank == len(fit.names) else f"{count} points of one valley"
-    lines = [f"{total - lost} of {total} starts ended in {where}:  sum of squares, starts, values"]
+        if total > 1:
+            return [" ".join([ended, *unfinished])]
+        return []
+    if fit.rank == len(fit.names):
+        where = f"{count} minima"
+    else:
+        where = f"{count} points of one valley"
+    lines = [
+        (
+            f"{total - lost} of {total} starts ended in {where}:  sum of squares, "
+            f"starts, "
+            f"values"
+        )
+    ]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
-        values, squares = named_values(fit, minimum.value), minimum.sum_of_squares
-        squares = 0.0 if squares <= fit.problem.exact_squares else squares
+        values = named_values(fit, minimum.value)
+        squares = minimum.sum_of_squares
+        if squares <= fit.problem.exact_squares:
+            squares = 0.0
         lines.append(f"  {squares:12.5g} {minimum.count:4d}   {values}")
     if count > _MINIMA_SHOWN:
         lines.append(f"  ... and {count - _MINIMA_SHOWN} more")
@@ -293,26 +438,48 @@ def _minima(fit: "Fit") -> list[str]:
 
 
 def _shots(fit: "Fit") -> list[str]:
-    """Lines of the table of the first shots: velocities before, measured and fitted; status."""
+    """Lines of the table of the first shots: velocities before, measured and fitted;
+    status.
+    """
     data = fit.experiments
     if data is None:
         return []
     mixed = len(set(data.units)) > 1
-    common_unit = "" if mixed else f" [{data.units[0]}]"
-    which = "coord" if mixed else "body"
+    if mixed:
+        common_unit = ""
+    else:
+        common_unit = f" [{data.units[0]}]"
+    if mixed:
+        which = "coord"
+    else:
+        which = "body"
     head = f"{'shot':>8s} {which:>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
-    lines, (shots, bodies) = [head + common_unit], data.pre.shape
-    before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
+    lines = [head + common_unit]
+    shots, bodies = data.pre.shape
+    before = np.asarray(data.pre, float)
+    measured = np.asarray(data.post, float)
     largest = np.abs(fit.predicted).max(axis=1, keepdims=True)
     fitted = np.where(np.abs(fit.predicted) <= _ROUNDING * largest, 0.0, fit.predicted)
     shown = max(1, _VELOCITIES_SHOWN // bodies)
     for k, i in np.ndindex(*before[:shown].shape):
-        label = data.shots[k] if i == 0 else ""
-        status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
-        value = "-" if np.isnan(measured[k, i]) else formatted(measured[k, i], ".6g")
+        if i == 0:
+            label = data.shots[k]
+        else:
+            label = ""
+        if fit.status[k] and i == 0:
+            status = STATUS[int(fit.status[k])].name
+        else:
+            status = ""
+        if np.isnan(measured[k, i]):
+            value = "-"
+        else:
+            value = formatted(measured[k, i], ".6g")
         pre, law = (formatted(x[k, i], ">12.6g") for x in (before, fitted))
         row = f"{label:>8s} {i + 1:>5d} {pre} {value:>12s} {law}"
-        unit = f" {data.units[i]}" if mixed else ""
+        if mixed:
+            unit = f" {data.units[i]}"
+        else:
+            unit = ""
         lines.append(f"{row}{unit}   {status}".rstrip())
     if shots > shown:
         lines.append(f"     ... and {counted(shots - shown, 'more shot')}")
@@ -323,14 +490,20 @@ def _shots(fit: "Fit") -> list[str]:
 
 
 def verdict(fit: "Fit") -> str:
-    """The sentence of `Fit.verdict`: values, what speaks against the law, and reservations."""
+    """The sentence of `Fit.verdict`: values, what speaks against the law, and
+    reservations.
+    """
     law = type(fit.law).__name__
     if not fit.converged:
         return f"No answer: the search for the parameters of {law} has not converged."
-    reserved, sentence = joined_words(fit.reservations), _values_in_words(fit)
+    reserved = joined_words(fit.reservations)
+    sentence = _values_in_words(fit)
     against = _objection(fit)
     if against:
-        nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
+        if fit.determined.any():
+            nearest = f"it comes nearest with {sentence}"
+        else:
+            nearest = sentence
         sentence = f"{law} {against}; {nearest}"
     if reserved:
         sentence += f"; {'and' if against else 'but'} {reserved}"
@@ -338,7 +511,9 @@ def verdict(fit: "Fit") -> str:
 
 
 def report(fit: "Fit") -> str:
-    """The report, blocks of lines: verdict, head, tables of parameters, quality, minima, shots."""
+    """The report, blocks of lines: verdict, head, tables of parameters, quality,
+    minima, shots.
+    """
     blocks = [
         [fit.verdict],
         [_headline(fit)],
@@ -357,7 +532,15 @@ def as_record(fit: "Fit") -> dict[str, Any]:
     """A fit as a dictionary of JSON data, for `Fit.to_dict`."""
     as_they_are = (
         *("method", "rms", "noise", "degrees_of_freedom", "rank", "identifiability"),
-        *("findings", "warnings", "verdict", "reservations", "seed", "converged", "covariance"),
+        *(
+            "findings",
+            "warnings",
+            "verdict",
+            "reservations",
+            "seed",
+            "converged",
+            "covariance",
+        ),
         *("correlation", "predicted", "residual"),
     )
     parameters = [
@@ -376,7 +559,9 @@ def as_record(fit: "Fit") -> dict[str, Any]:
     record = {
         "law": type(fit.law).__name__,
         "parameters": parameters,
-        "starts": [{name: getattr(each, name) for name in of_minimum} for each in fit.starts],
+        "starts": [
+            {name: getattr(each, name) for name in of_minimum} for each in fit.starts
+        ],
         "shots": [] if fit.experiments is None else fit.experiments.shots,
         "status": [STATUS[code].name for code in fit.status],
     }
@@ -387,26 +572,40 @@ def as_record(fit: "Fit") -> dict[str, Any]:
 
 
 def save_fit(fit: "Fit", path: str | Path) -> Path:
-    """Write a fit to a JSON file, for `Fit.save`: its format, versions, and encoded fields.
+    """Write a fit to a JSON file, for `Fit.save`: its format, versions, and encoded
+    fields.
 
     Raises:
         ValueError: a fit to something else than shots, or with ties.
     """
     if fit.experiments is None:
-        raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
+        raise ValueError(
+            "Argument `fit` must be to shots to be saved: functions cannot be."
+        )
     if fit.problem.ties:
-        raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-    complete = dataclasses.replace(fit, known_findings=fit.findings, known_profiles=fit.profiles)
-    record = {"format": FORMAT, "versions": versions(), "result": encoded(complete)["fields"]}
+        raise ValueError(
+            "Argument `fit` must have no ties to be saved: functions cannot be."
+        )
+    complete = dataclasses.replace(
+        fit, known_findings=fit.findings, known_profiles=fit.profiles
+    )
+    record = {
+        "format": FORMAT,
+        "versions": versions(),
+        "result": encoded(complete)["fields"],
+    }
     path = Path(path)
-    path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8"
+    )
     return path
 
 
 def load_fit(path: str | Path) -> "Fit":
     """The fit that `Fit.save` wrote, to the last digit; `ji.load` reads motions, too.
 
-    The classes of its law and scene are imported by name, so read only files that you trust.
+    The classes of its law and scene are imported by name, so read only files that you
+    trust.
 
     Args:
         path: the file.
@@ -415,11 +614,13 @@ def load_fit(path: str | Path) -> "Fit":
         `Fit`, with all that one can do with it.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not a fit, one of another format, or a law that
-            cannot be imported.
+        FileNotFoundError: no such file. ValueError: not a fit, one of another format,
+            or a law that cannot be imported.
 
     >>> import pathlib, tempfile, jimpact as ji
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> data = ji.Experiments(
+    ...     [[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02
+    ... )
     >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
     >>> path = fit.save(pathlib.Path(tempfile.mkdtemp()) / "fit.json")
     >>> ji.load(path).verdict == fit.verdict
@@ -429,35 +630,45 @@ def load_fit(path: str | Path) -> "Fit":
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path}: the file must be a saved fit (JSON), but {error}.") from None
+        raise ValueError(
+            f"{path}: the file must be a saved fit (JSON), but {error}."
+        ) from None
     if not isinstance(record, dict) or "format" not in record:
         raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")
     writer = record.get("versions", {}).get("jimpact", "an unknown version")
     if record["format"] != FORMAT:
         raise ValueError(
             f"{path}: the file must be a fit saved in format {FORMAT}, but has format "
-            f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
+            f"{record['format']} (written by jimpact {writer}; this is "
+            f"{jimpact.__version__})."
         )
     try:
         with jax.enable_x64(True):  # arrays keep the precision that they were saved in
             return instance_of(Fit, _of_this_build(record["result"]))
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
-            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
+            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A "
+            f"law of your "
             "own must be imported before."
         ) from error
 
 
 def _of_this_build(result: dict[str, Any]) -> dict[str, Any]:
-    """Encoded fields of a fit as this build names them, from those that an older build saved.
+    """Encoded fields of a fit as this build names them, from those that an older build
+    saved.
 
-    Before 0.2 there were sentences in the place of findings; then fields of `search` and `errors`
-    stood beside the others.
+    Before 0.2 there were sentences in the place of findings; then fields of `search`
+    and `errors` stood beside the others.
     """
     if "warnings" in result:
-        lines, reservations = (decoded(result.pop(name)) for name in ("warnings", "reservations"))
+        lines, reservations = (
+            decoded(result.pop(name)) for name in ("warnings", "reservations")
+        )
         problem = result["problem"]["fields"]
-        fixed = any(note.startswith("stiffness[1] is fixed") for note in decoded(problem["notes"]))
+        fixed = any(
+            note.startswith("stiffness[1] is fixed")
+            for note in decoded(problem["notes"])
+        )
         problem["parameters"]["fields"]["ratios"] = fixed
         result = result | {"findings": encoded(of_sentences(lines, reservations))}
     if "search" not in result:
@@ -469,7 +680,8 @@ def _of_this_build(result: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-# ---------------------------------------------------------------------------- the result
+# ---------------------------------------------------------------------------- the
+# result
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -483,8 +695,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         method: of minimizing, see `fit`.
         names: of the parameters, contacts numbered from 1.
         value: (P,) in the units of each parameter, as the next two.
-        standard_error: (P,); inf where the data do not determine a parameter, NaN where no degree
-            of freedom is left to estimate the noise from.
+        standard_error: (P,); inf where the data do not determine a parameter, NaN where
+            no degree of freedom is left to estimate the noise from.
         covariance: (P, P).
         correlation: (P, P), in [-1, 1].
         bounds: lowest and highest values (P,), (P,).
@@ -492,8 +704,10 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         predicted: shaped like what was measured, (K, n) [m/s].
         residual: measured less predicted (K, n) [m/s]; NaN where no value was measured.
         rms: of the residual.
-        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
-            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor that
+        noise: estimated standard error of one value; NaN where no degree of freedom is
+            left, 1
+            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor
+            that
             the standard errors are multiplied by.
         degrees_of_freedom: independent measured values less `rank`.
         rank: of the Jacobian; below P: see `identifiability`.
@@ -504,16 +718,18 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         converged: whether the best start did.
         steps: iterations of the best start.
         lost_starts: how many were given up far above the best, or did not converge.
-        stuck: whether no step lowers the sum of squares, although derivatives promise it.
-        pre: true v- (K, n) that agree best with the law and the data, where v- have errors; else
-            None. `predicted` is then `v+(pre) + slopes (v- - pre)`: the law at the measured v-,
-            linearized.
+        stuck: whether no step lowers the sum of squares, although derivatives promise
+            it.
+        pre: true v- (K, n) that agree best with the law and the data, where v- have
+            errors; else None. `predicted` is then `v+(pre) + slopes (v- - pre)`: the
+            law at the measured v-, linearized.
         slopes: `dv+/dv-` (K, n, n) at these v-, or None.
-        findings: what is wrong with data or fit, by kind, shots and numbers; computed on first
-            access, as profiles are.
+        findings: what is wrong with data or fit, by kind, shots and numbers; computed
+            on first access, as profiles are.
         warnings: the same in words.
         problem: what was solved.
-        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN
+            where no
             value was measured.
         loss: see `fit`.
         seed: of the random starts.
@@ -521,7 +737,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         search: where it ended: `value`, `starts`, `predicted`, .. are its fields.
         errors: linearized: `standard_error`, `covariance`, `rank`, .. are its fields.
         reservations: in words, what has to be said where a value is quoted.
-        judged: what the tests behind `findings` need; None of a fit that was read from a file.
+        judged: what the tests behind `findings` need; None of a fit that was read from
+            a file.
         wants_profiles: the argument `profiles` of `fit`.
         progress: of profiles, see `Search`.
         known_findings: those that a file holds; None: computed on first access.
@@ -544,7 +761,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         return as_record(self)
 
     def save(self, path: str | Path) -> Path:
-        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
+        """Write the fit to a file (JSON) that `ji.load` reads: problem, result,
+        versions.
 
         Args:
             path: the file; an existing file is replaced.
@@ -553,7 +771,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
             The path.
 
         Raises:
-            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+            ValueError: a fit of something else than shots, or with ties: functions
+                cannot be saved.
         """
         return save_fit(self, path)
 
@@ -562,4 +781,6 @@ def check_squares(name: str, fit: Any) -> None:
     """Raise an error unless argument `name` is a fit by least squares."""
     check_kind(name, fit, Fit)
     if fit.loss != "squares":
-        raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")
+        raise ValueError(
+            f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}."
+        )

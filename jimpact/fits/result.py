@@ -1,4 +1,6 @@
-"""`FitResult`: what a fit finds, in numbers; findings and profiles when they are asked for."""
+"""`FitResult`: what a fit finds, in numbers; findings and profiles when they are asked
+for.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,18 +29,23 @@ from jimpact.tools.records import Column, Table, Tabular, counted, plain
 from jimpact.tools.status import STATUS
 
 _PRINTED_SHOTS = 12  # of predictions; ten times more fill pages
-# Share of a prior's standard deviation from which on a standard error is the prior's: the data have
-# then less than a tenth of the information. Ten times as much would call priors of half of it so.
+# Share of a prior's standard deviation from which on a standard error is the prior's:
+# the data have then less than a tenth of the information. Ten times as much would call
+# priors of half of it so.
 PRIOR_ALONE = 0.95
-# Shots up to which a fit profiles of itself, with one start and with several: as long as half of
-# the fit. Parameters: with four of LZB it takes longer than the search.
-FEW_SHOTS, MANY_SHOTS, MOST_PARAMETERS = 64, 256, 3
-NOT_SAVED: Mapping[str, bool] = MappingProxyType({"saved": False})  # of fields that no file holds
+# Shots up to which a fit profiles of itself, with one start and with several: as long
+# as half of the fit. Parameters: with four of LZB it takes longer than the search.
+FEW_SHOTS = 64
+MANY_SHOTS = 256
+MOST_PARAMETERS = 3
+# of fields that no file holds
+NOT_SAVED: Mapping[str, bool] = MappingProxyType({"saved": False})
 
 
 class FittedParameter(NamedTuple):
-    """A parameter of a fit: its value, standard error, 95 % interval in pieces, and whether the
-    data determine it."""
+    """A parameter of a fit: its value, standard error, 95 % interval in pieces, and
+    whether the data determine it.
+    """
 
     value: float
     standard_error: float
@@ -47,10 +54,12 @@ class FittedParameter(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,).
+    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status
+    codes (K,).
 
-    `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K, n) are the
-    ends of the band in which such a measurement lies. `units` (n,): of the velocities.
+    `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K,
+    n) are the ends of the band in which such a measurement lies. `units` (n,): of the
+    velocities.
     """
 
     velocity: np.ndarray
@@ -62,7 +71,9 @@ class Predicted(NamedTuple):
     units: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Table of predictions, a row for each velocity of the first shots; status if not ok."""
+        """Table of predictions, a row for each velocity of the first shots; status if
+        not ok.
+        """
         columns = (
             *(Column("shot"), Column("coordinate"), Column("velocity", ".5g")),
             *(Column("standard_error", ".2g", "std. error"), Column("low", ".5g")),
@@ -70,15 +81,27 @@ class Predicted(NamedTuple):
         )
         rows = [
             [
-                *(k + 1, i + 1, plain(float(self.velocity[k, i])), self.standard_error[k, i]),
+                *(
+                    k + 1,
+                    i + 1,
+                    plain(float(self.velocity[k, i])),
+                    self.standard_error[k, i],
+                ),
                 *(self.low[k, i], self.high[k, i], self.units[i]),
                 STATUS[int(self.status[k])].name if self.status[k] else None,
             ]
             for k, i in np.ndindex(*self.velocity[:_PRINTED_SHOTS].shape)
         ]
         more = len(self.velocity) - _PRINTED_SHOTS
-        notes = [f"... and {counted(more, 'more shot')}"] if more > 0 else []
-        return str(Table(columns, rows, notes=[*notes, "low to high: of a measurement."], keys=2))
+        if more > 0:
+            notes = [f"... and {counted(more, 'more shot')}"]
+        else:
+            notes = []
+        return str(
+            Table(
+                columns, rows, notes=[*notes, "low to high: of a measurement."], keys=2
+            )
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,21 +136,33 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
     @cached_property
     @in_own_precision
     def profiles(self) -> tuple[Profile, ...]:
-        """Profiles of all parameters if `wants_profiles`, or if it is None and they are needed."""
+        """Profiles of all parameters if `wants_profiles`, or if it is None and they are
+        needed.
+        """
         if self.known_profiles is not None:
             return self.known_profiles
-        if not (self._needs_profiles if self.wants_profiles is None else self.wants_profiles):
+        if not (
+            self._needs_profiles if self.wants_profiles is None else self.wants_profiles
+        ):
             return ()
-        points = PROFILE_STARTS if self.wants_profiles else 0
+        if self.wants_profiles:
+            points = PROFILE_STARTS
+        else:
+            points = 0
         return profiles_of(self, range(len(self.names)), LEVEL, points, self.progress)
 
     @property
     def _needs_profiles(self) -> bool:
-        """True where standard errors may mislead, and profiles cost no more than the fit.
+        """True where standard errors may mislead, and profiles cost no more than the
+        fit.
 
-        Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
+        Not after lack of fit: no interval of such a law means anything, and its valleys
+        are rough.
         """
-        most = FEW_SHOTS if self.start_count == 1 else MANY_SHOTS
+        if self.start_count == 1:
+            most = FEW_SHOTS
+        else:
+            most = MANY_SHOTS
         few = self.experiments is not None and len(self.predicted) <= most
         few &= len(self.names) <= MOST_PARAMETERS
         rejected = any(each.kind == "lack_of_fit" for each in self._findings_of_search)
@@ -144,27 +179,48 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         return tuple(each.reservation for each in self.findings if each.reservation)
 
     def found(self, kind: str) -> bool:
-        """True if there is a finding of this kind, one of `jimpact.fits.findings.KINDS`."""
+        """True if there is a finding of this kind, one of
+        `jimpact.fits.findings.KINDS`.
+        """
         return any(each.kind == kind for each in self.findings)
 
     @property
     def table(self) -> Table:
-        """A row for each parameter: value, standard error, ends of its 95 % interval, flags."""
-        names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
+        """A row for each parameter: value, standard error, ends of its 95 % interval,
+        flags.
+        """
+        names = (
+            "value",
+            "standard_error",
+            "low_95",
+            "high_95",
+            "at_bound",
+            "determined",
+        )
         ends = self.confidence_interval().T
-        columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
+        columns = (
+            self.value,
+            self.standard_error,
+            *ends,
+            self.at_bound,
+            self.determined,
+        )
         rows = list(zip(self.names, *(column.tolist() for column in columns)))
         return Table([Column(name) for name in ("parameter", *names)], rows)
 
     @property
     @in_own_precision
     def scene(self) -> Scene | None:
-        """The scene of all shots, with what was fitted of it; None: the shots have their own."""
+        """The scene of all shots, with what was fitted of it; None: the shots have
+        their own.
+        """
         return self.problem.to_scene(self.value)
 
     @property
     def determined(self) -> np.ndarray:
-        """True (P,) for parameters that the data bound at all; the values of others are starts."""
+        """True (P,) for parameters that the data bound at all; the values of others are
+        starts.
+        """
         seen = ~np.isinf(self.standard_error)
         for i, each in enumerate(self.profiles):
             seen[i] &= each.determines
@@ -172,7 +228,9 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def from_prior(self) -> np.ndarray:
-        """True (P,) for parameters known by their priors alone: data hardly reduce their errors."""
+        """True (P,) for parameters known by their priors alone: data hardly reduce
+        their errors.
+        """
         std = np.full(len(self.names), np.inf)
         for prior in self.problem.priors:
             std[prior.parameter] = prior.std
@@ -182,7 +240,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
     @in_own_precision
     def tied(self) -> dict[str, tuple[float, float]]:
         """Values of tied entries with their standard errors, by name."""
-        problem, ties = self.problem, self.problem.ties
+        problem = self.problem
+        ties = self.problem.ties
         if not ties:
             return {}
 
@@ -191,14 +250,18 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             law = problem.law_in_scene(x)
             return jnp.concatenate([tied_value(law, tie) for tie in ties])
 
-        x, names = jnp.asarray(self.value, problem.precision), tied_names(problem.law, ties)
+        x = jnp.asarray(self.value, problem.precision)
+        names = tied_names(problem.law, ties)
         errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
-        return dict(zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist())))
+        return dict(
+            zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist()))
+        )
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
         """Standard errors (...) of functions of the parameters, by linear propagation.
 
-        Equation: `sqrt(J C J^T)`; inf where a function depends on what the data do not determine.
+        Equation: `sqrt(J C J^T)`; inf where a function depends on what the data do not
+        determine.
 
         Args:
             slope: J, derivatives (..., P) of the functions in the parameters.
@@ -206,17 +269,22 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         seen = self.determined
         determined_slope = slope[..., seen]
         covariance = self.covariance[np.ix_(seen, seen)]
-        variance = np.einsum("...p,pq,...q->...", determined_slope, covariance, determined_slope)
+        variance = np.einsum(
+            "...p,pq,...q->...", determined_slope, covariance, determined_slope
+        )
         blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
         return np.where(blind, np.inf, np.sqrt(variance))
 
     @in_own_precision
-    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
-        """Velocities after further shots, with the errors that the parameters leave in them.
+    def predict(
+        self, shots: Any, scene: Scene | None = None, level: float = 0.95
+    ) -> Predicted:
+        """Velocities after further shots, with the errors that the parameters leave in
+        them.
 
-        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
-        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
-        quantile as in `intervals`.
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance;
+        a measurement, with its own standard error s, lies within
+        `q sqrt(J C J^T + s^2)`, q the quantile as in `intervals`.
 
         Args:
             shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
@@ -224,40 +292,58 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             level: of the band.
 
         Returns:
-            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
-            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
-            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
-            `high` (K, n), the band of a measurement.
+            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on
+            what the data do not determine, NaN where the errors are unknown; `status`
+            (K,); `noise` (K, n) of a
+            measurement: the `sigma` of the shots if they have one, else as in the fit;
+            `low` and `high` (K, n), the band of a measurement.
 
         Raises:
-            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
-                scene that does not fit the law; a level outside (0, 1).
+            ValueError: a fit of something else than shots; velocities that do not fit
+                the scene, a scene that does not fit the law; a level outside (0, 1).
         """
         quantile = self.quantile(level)
         if self.experiments is None:
             raise ValueError("Argument `fit` must be to shots.")
-        data, scenes, units, sigma = shots, None, self.experiments.units, None
+        data = shots
+        scenes = None
+        units = self.experiments.units
+        sigma = None
         if isinstance(shots, Experiments):
-            data, scenes, units, sigma = shots.pre, shots.scenes, shots.units, shots.sigma
+            data = shots.pre
+            scenes = shots.scenes
+            units = shots.units
+            sigma = shots.sigma
         if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
             raise ValueError(
-                f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of "
+                f"Argument `shots` must have shape (K, {len(units)}), velocities of "
+                f"the bodies of "
                 f"the fit, but has shape {np.shape(data)}."
             )
         check_values("shots", data)
-        data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
+        data = Experiments(
+            data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units
+        )
         if isinstance(self.problem.law, LawInScene) and scene is not None:
             raise ValueError(
-                "Argument `scene` must be left out where parts of the scene were fitted: they hold "
+                "Argument `scene` must be left out where parts of the scene were "
+                "fitted: they hold "
                 "for that of the fit only."
             )
-        common = self.problem.scene if scene is None else scene
-        largest = common if scenes is None else max(scenes, key=lambda each: each.contacts)
+        if scene is None:
+            common = self.problem.scene
+        else:
+            common = scene
+        if scenes is None:
+            largest = common
+        else:
+            largest = max(scenes, key=lambda each: each.contacts)
         self._check_scene(largest, len(units))
         problem = self.problem.of_other(data, common)
         outcome = solution_of(problem, outcome_at(problem, self.value))
         error = self.errors_of(problem.derivatives(outcome.starts[0]))
-        value, noise = outcome.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
+        value = outcome.predicted
+        noise = np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
         return Predicted(
             velocity=value,
@@ -270,26 +356,40 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         )
 
     def _check_scene(self, scene: Any, size: int) -> None:
-        """Raise unless `scene` has `size` velocities and the contacts of the law's parameters."""
+        """Raise unless `scene` has `size` velocities and the contacts of the law's
+        parameters.
+        """
         check_kind("scene", scene, Scene)
-        values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
+        values = [
+            x.value for x in parameters_of(self.law).values() if x.domain.per_contact
+        ]
         counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
         if scene.size != size or counts - {scene.contacts}:
-            also = f" and {min(counts)} contacts, one for each value of the law" if counts else ""
+            if counts:
+                also = f" and {min(counts)} contacts, one for each value of the law"
+            else:
+                also = ""
             raise ValueError(
-                f"Argument `scene` must have {size} velocities as the fit{also}, but has "
+                f"Argument `scene` must have {size} velocities as the fit{also}, but "
+                f"has "
                 f"{scene.size} and {scene.contacts}."
             )
 
     def _noise_of(self, sigma: Any) -> np.ndarray:
-        """Standard errors of measured velocities: sigma, stretched as in the fit; None: of the fit.
+        """Standard errors of measured velocities: sigma, stretched as in the fit; None:
+        of the fit.
 
         The latter are the root mean squares (n,) over its shots.
         """
         if sigma is not None:
-            stretched = 1.0 if self.problem.sigma is None else self.noise
+            if self.problem.sigma is None:
+                stretched = 1.0
+            else:
+                stretched = self.noise
             return stretched * np.asarray(sigma, float)
-        weight = np.ma.masked_equal(np.asarray(self.problem.measurement.weight, float), 0.0)
+        weight = np.ma.masked_equal(
+            np.asarray(self.problem.measurement.weight, float), 0.0
+        )
         # NaN: never measured
         return self.noise * np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)
 
@@ -297,19 +397,25 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         """The parameter of this name, as in `names`."""
         check_choice("name", name, self.names)
         i = self.names.index(name)
-        value, error = float(self.value[i]), float(self.standard_error[i])
-        return FittedParameter(value, error, self.intervals()[i], bool(self.determined[i]))
+        value = float(self.value[i])
+        error = float(self.standard_error[i])
+        return FittedParameter(
+            value, error, self.intervals()[i], bool(self.determined[i])
+        )
 
-    def intervals(self, level: float = LEVEL) -> tuple[tuple[tuple[float, float], ...], ...]:
+    def intervals(
+        self, level: float = LEVEL
+    ) -> tuple[tuple[tuple[float, float], ...], ...]:
         """The pieces, in order, of the confidence interval of each of the P parameters.
 
-        Those of `profiles`, if there are some of this level. Else linearized, cut at the bounds, a
-        piece for every minimum that fits well enough.
+        Those of `profiles`, if there are some of this level. Else linearized, cut at
+        the bounds, a piece for every minimum that fits well enough.
 
-        Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
-        freedom that are left, or of the normal law if `sigma` is known; of what is fitted in
-        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
-        is higher by d, q^2 - d / noise^2 in place of q^2.
+        Equation: `value -+ q standard_error`, q the quantile of Student's t with the
+        degrees of freedom that are left, or of the normal law if `sigma` is known; of
+        what is fitted in
+        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum
+        of squares is higher by d, q^2 - d / noise^2 in place of q^2.
         """
         if self.profiles and self.profiles[0].level == level:
             return tuple(profile.intervals for profile in self.profiles)
@@ -317,7 +423,9 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     def confidence_interval(self, level: float = LEVEL) -> np.ndarray:
         """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
-        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
+        return np.array(
+            [(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)]
+        )
 
     @property
     def shows_lack_of_fit(self) -> bool:

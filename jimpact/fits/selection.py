@@ -37,9 +37,9 @@ _TIERS = ("fits", "lack of fit", "worse", "fails")
 class LawFit:
     """The fit of a law, its error in shots left out, and the verdict of the tests.
 
-    `left_out_error` is the root mean square error of shots predicted from the others [m/s], NaN of
-    fewer than two shots; `aicc` is NaN where it is meaningless (see `fit_laws`); `verdict` is
-    'fits', or why not.
+    `left_out_error` is the root mean square error of shots predicted from the others
+    [m/s], NaN of fewer than two shots; `aicc` is NaN where it is meaningless (see
+    `fit_laws`); `verdict` is 'fits', or why not.
     """
 
     name: str
@@ -62,7 +62,9 @@ class LawFit:
     def to_dict(self) -> dict[str, Any]:
         """The record of a law as JSON data."""
         names = ("parameters", "left_out_error", "aicc", "adequate", "verdict", "fit")
-        return as_data({"rms": self.fit.rms} | {name: getattr(self, name) for name in names})
+        return as_data(
+            {"rms": self.fit.rms} | {name: getattr(self, name) for name in names}
+        )
 
 
 _COLUMNS = (
@@ -79,8 +81,8 @@ _COLUMNS = (
 class LawFits(Tabular):
     """The result of `fit_laws`: `entries` by name, the simplest adequate law first.
 
-    `left_out` says by name why a law was not tried; `speed` whether the first law's e depends on
-    the speed, if requested, and `speed_fit` is the fit of its exponent.
+    `left_out` says by name why a law was not tried; `speed` whether the first law's e
+    depends on the speed, if requested, and `speed_fit` is the fit of its exponent.
     """
 
     entries: dict[str, LawFit]
@@ -95,18 +97,24 @@ class LawFits(Tabular):
 
     @property
     def verdict(self) -> str:
-        """A sentence on the simplest adequate law, or the nearest one, with its values."""
+        """A sentence on the simplest adequate law, or the nearest one, with its
+        values.
+        """
         best = self.best
         which = f"No law fits; the nearest is {best.name} ({best.verdict})"
         if best.adequate:
             which = f"The simplest law that fits is {best.name}"
         elif best.tier == "lack of fit":
-            which = f"No law fits; the simplest that predicts as well as any is {best.name}"
+            which = (
+                f"No law fits; the simplest that predicts as well as any is {best.name}"
+            )
         return f"{which}: {best.fit.verdict}"
 
     @property
     def table(self) -> Table:
-        """A row for each law: parameters, rms, error of shots left out, AICc, verdict."""
+        """A row for each law: parameters, rms, error of shots left out, AICc,
+        verdict.
+        """
         rows = [
             [name, x.parameters, x.fit.rms, x.left_out_error, x.aicc, x.verdict]
             for name, x in self.entries.items()
@@ -115,25 +123,49 @@ class LawFits(Tabular):
 
     def to_dict(self) -> dict[str, Any]:
         """The comparison as JSON data."""
-        record = {"best": self.best.name, "verdict": self.verdict, "left_out": self.left_out}
+        record = {
+            "best": self.best.name,
+            "verdict": self.verdict,
+            "left_out": self.left_out,
+        }
         speed = {"speed": self.speed, "speed_fit": self.speed_fit}
         return record | as_data({"laws": self.entries} | speed)
 
     def __str__(self) -> str:
-        """The table with the values of the parameters, and notes on other laws and the speed."""
+        """The table with the values of the parameters, and notes on other laws and the
+        speed.
+        """
         fits = [entry.fit for entry in self.entries.values()]
-        rows = [(*row, named_values(x, x.value)) for row, x in zip(self.table.rows, fits)]
+        rows = [
+            (*row, named_values(x, x.value)) for row, x in zip(self.table.rows, fits)
+        ]
         notes = ["rms and error of shots left out in m/s; simplest adequate law first."]
         if not all(x.determined.all() for x in fits):
-            notes.append("Values in brackets are starts, which the data do not determine.")
-        notes += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
+            notes.append(
+                "Values in brackets are starts, which the data do not determine."
+            )
+        notes += [
+            f"{name} is left out: it {reason}" for name, reason in self.left_out.items()
+        ]
         if self.speed is not None:
-            notes.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
+            notes.append(
+                f"Restitution that depends on the speed ({self.best.name}): "
+                f"{self.speed}"
+            )
         if self.speed_fit is not None:
             tier, against = _verdict_alone(self.speed_fit)
-            so = "the data then fit" if tier == "fits" else f"still {against}"
-            fitted = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
-            values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in fitted)
+            if tier == "fits":
+                so = "the data then fit"
+            else:
+                so = f"still {against}"
+            fitted = zip(
+                self.speed_fit.names,
+                self.speed_fit.value,
+                self.speed_fit.standard_error,
+            )
+            values = ", ".join(
+                f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in fitted
+            )
             notes.append(f"With it {values}: {so}.")
         columns = (*_COLUMNS, Column("values"))
         return str(Table(columns, rows, head=[self.verdict, ""], notes=notes))
@@ -142,8 +174,8 @@ class LawFits(Tabular):
 class NestedTest(NamedTuple):
     """A test of further parameters: by F, or by chi^2 where sigma is known and fits.
 
-    `statistic` of `more` parameters, and of the `degrees_of_freedom` left (None: chi^2); the
-    p-value `chance`; `names` of the further parameters.
+    `statistic` of `more` parameters, and of the `degrees_of_freedom` left (None:
+    chi^2); the p-value `chance`; `names` of the further parameters.
     """
 
     statistic: float
@@ -159,12 +191,19 @@ class NestedTest(NamedTuple):
 
     def __str__(self) -> str:
         """The test in a sentence: statistic, degrees of freedom, p-value."""
-        needed, rest = "needed" if self.needed else "not needed", self.degrees_of_freedom
-        kind, freedom = "chi^2", degrees(self.more)
+        if self.needed:
+            needed = "needed"
+        else:
+            needed = "not needed"
+        rest = self.degrees_of_freedom
+        kind = "chi^2"
+        freedom = degrees(self.more)
         if rest is not None:
-            kind, freedom = "F", f"{self.more} and {degrees(rest)}"
+            kind = "F"
+            freedom = f"{self.more} and {degrees(rest)}"
         return (
-            f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with {freedom}, "
+            f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with "
+            f"{freedom}, "
             f"p-value {self.chance:.2g} (needed: below {WORSE:g})."
         )
 
@@ -174,15 +213,17 @@ class NestedTest(NamedTuple):
 
 
 def nested_test(simple: Fit, full: Fit) -> NestedTest:
-    """Test by F or chi^2 if the data need the parameters that one fit has beyond another one.
+    """Test by F or chi^2 if the data need the parameters that one fit has more.
 
-    Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters that
-    the data determine, f degrees of freedom of the full fit; with sigma, unless the full fit
-    contradicts it, `S - S_full` is chi^2 with q degrees of freedom. Where the simple law is at the
-    end of a domain of the full one (a yield speed of 0), the p-value is up to twice too large.
+    Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further
+    parameters that the data determine, f degrees of freedom of the full fit; with
+    sigma, unless the full fit contradicts it, `S - S_full` is chi^2 with q degrees of
+    freedom. Where the simple law is at the end of a domain of the full one (a yield
+    speed of 0), the p-value is up to twice too large.
 
     Args:
-        simple, full: fits by least squares of the same data; the law of `simple` is a special case.
+        simple, full: fits by least squares of the same data; the law of `simple` is a
+            special case.
 
     Returns:
         `NestedTest`; `print` says it in words.
@@ -193,7 +234,8 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     >>> import jimpact as ji
     >>> data = ji.Experiments(
     ...     pre=[[1.0, 0.0], [2.0, 0.0], [4.0, 0.0], [8.0, 0.0]],
-    ...     post=[[0.1, 0.9], [0.26, 1.74], [0.63, 3.37], [1.48, 6.52]], sigma=0.005,
+    ...     post=[[0.1, 0.9], [0.26, 1.74], [0.63, 3.37], [1.48, 6.52]],
+    ...     sigma=0.005,
     ... )
     >>> law, pair = ji.Newton(0.7), ji.chain([1.0, 1.0])
     >>> constant = ji.fit(law, pair, data)
@@ -203,13 +245,16 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     """
     for name, each in (("simple", simple), ("full", full)):
         check_squares(name, each)
-    same = np.array_equal(simple.problem.measured, full.problem.measured, equal_nan=True)
+    same = np.array_equal(
+        simple.problem.measured, full.problem.measured, equal_nan=True
+    )
     if not same:
         raise ValueError("Arguments `simple` and `full` must be fits of the same data.")
     more = full.rank - simple.rank
     if more < 1:
         raise ValueError(
-            "Argument `full` must have more parameters that the data see than `simple`, "
+            "Argument `full` must have more parameters that the data see than "
+            "`simple`, "
             f"but has {full.rank} and {simple.rank}."
         )
     names = tuple(x for x in full.names if x not in simple.names) or full.names
@@ -219,10 +264,14 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     return _f_test(gain, more, full, names)
 
 
-def _f_test(gain: float, more: int, full: Fit, names: tuple[str, ...] = ()) -> NestedTest:
-    """F test of `more` parameters that lower the sum of squares by `gain` to that of `full`.
+def _f_test(
+    gain: float, more: int, full: Fit, names: tuple[str, ...] = ()
+) -> NestedTest:
+    """F test of `more` parameters that lower the sum of squares by `gain` to that of
+    `full`.
 
-    Equation: `F = (gain / more) / (S_full / f)`, f degrees of freedom left; p-value 1 without any.
+    Equation: `F = (gain / more) / (S_full / f)`, f degrees of freedom left; p-value 1
+    without any.
     """
     freedom = full.degrees_of_freedom
     if freedom < 1:
@@ -247,27 +296,29 @@ def fit_laws(
 ) -> LawFits:
     """Every law on the same data: which is the simplest that is adequate?
 
-    Each law is fitted with one e for all contacts, with one each, and, where it has stiffnesses,
-    with and without free ratios of them; a `RestitutionMatrix` from an admissible one. A law is
-    adequate if its fit converges, shows no lack of fit (see `fit`), fails in no shot, and predicts
-    shots left out no worse than the best law does: a paired t test over shots at 1 %, of more than
-    64 shots linearized; of fewer than 4 an F test of the residuals at 5 %. Adequate laws come
-    first, those with fewer parameters before others, and of these the one that needs to know less
-    of the contacts, in the order of `advise`. AICc is reported if it is meaningful: rank full,
+    Each law is fitted with one e for all contacts, with one each, and, where it has
+    stiffnesses, with and without free ratios of them; a `RestitutionMatrix` from an
+    admissible one. A law is adequate if its fit converges, shows no lack of fit (see
+    `fit`), fails in no shot, and predicts shots left out no worse than the best law
+    does: a paired t test over shots at 1 %, of more than 64 shots linearized; of fewer
+    than 4 an F test of the residuals at 5 %. Adequate laws come first, those with fewer
+    parameters before others, and of these the one that needs to know less of the
+    contacts, in the order of `advise`. AICc is reported if it is meaningful: rank full,
     no parameter at a bound, no shot left out, degrees of freedom left.
 
     Args:
         scene: of all shots; ignored if each shot has its own scene.
         data: measured shots.
-        laws: names of the registry, or laws by a name of your own (each with its default free
-            parameters); None: all of the registry that these values make.
+        laws: names of the registry, or laws by a name of your own (each with its
+            default free parameters); None: all of the registry that these values make.
         free: further parameters, such as 'friction', fitted in every law that has them.
-        speed: test whether e of the first law depends on the speed (`VelocityDependent`).
+        speed: test whether e of the first law depends on the speed
+            (`VelocityDependent`).
         starts, seed, progress: as of `fit`, of every law.
         done: called with name and fit after every law.
-        values: parameters by name, `friction=0.2, stiffness=..., exponent=...`: starts of what is
-            fitted, fixed otherwise; restitution starts at 0.8. Without a stiffness, laws that need
-            it in SI units are left out.
+        values: parameters by name, `friction=0.2, stiffness=..., exponent=...`: starts
+            of what is fitted, fixed otherwise; restitution starts at 0.8. Without a
+            stiffness, laws that need it in SI units are left out.
 
     Returns:
         `LawFits`; `print` gives a table and why each law is adequate or not.
@@ -280,7 +331,9 @@ def fit_laws(
     >>> before = np.stack([np.linspace(1, 2, 6), np.zeros(6)], axis=1)
     >>> after = before @ [[0.2, 0.8], [0.8, 0.2]]
     >>> after += 0.01 * np.random.default_rng(1).normal(size=after.shape)
-    >>> laws = ji.fit_laws(ji.chain([1.0, 1.0]), ji.Experiments(before, after), ["newton"])
+    >>> laws = ji.fit_laws(
+    ...     ji.chain([1.0, 1.0]), ji.Experiments(before, after), ["newton"]
+    ... )
     >>> laws.best.name, laws.best.adequate
     ('newton', True)
     """
@@ -292,7 +345,11 @@ def fit_laws(
     options: dict[str, Any] = {"starts": starts, "profiles": False, "search": search}
     with progress_bar(progress) as show:
         for i, (name, (law, chosen)) in enumerate(candidates.items()):
-            show(f"fit_laws: {name}, law {i + 1} of {len(candidates)}", i, len(candidates))
+            show(
+                f"fit_laws: {name}, law {i + 1} of {len(candidates)}",
+                i,
+                len(candidates),
+            )
             try:
                 fits[name] = fit(law, scene, data, chosen, **options)
             except ValueError as error:
@@ -302,15 +359,23 @@ def fit_laws(
                 done(name, fits[name])
         if not fits:
             why = "; ".join(f"{name} {reason}" for name, reason in left_out.items())
-            raise ValueError(f"Argument `laws` must hold a law that can be fitted, but: {why}")
+            raise ValueError(
+                f"Argument `laws` must hold a law that can be fitted, but: {why}"
+            )
         entries = _judged(fits)
         best = next(iter(entries))
         fits[best] = replace(fits[best], wants_profiles=None)
         entries[best] = replace(entries[best], fit=fits[best])
         test = of_speed = None
         if speed:
-            show(f"fit_laws: {best}, dependence on the speed", len(candidates), len(candidates))
-            test, of_speed = _speed_test(fits[best], candidates[best], scene, data, options)
+            show(
+                f"fit_laws: {best}, dependence on the speed",
+                len(candidates),
+                len(candidates),
+            )
+            test, of_speed = _speed_test(
+                fits[best], candidates[best], scene, data, options
+            )
     return LawFits(entries, left_out, test, of_speed)
 
 
@@ -323,7 +388,8 @@ def _candidates(
     values: dict[str, Any],
     more: tuple[str, ...],
 ) -> tuple[dict[str, Candidate], dict[str, str]]:
-    """Laws to fit by name, each with what is free, and reasons why others are not tried, by name.
+    """Laws to fit by name, each with what is free, and reasons why others are not
+    tried, by name.
 
     Args:
         scenes: of the shots.
@@ -347,9 +413,11 @@ def _candidates(
     built, missing = registered_laws(values)
     left_out = missing | left_out
     alternatives = {
-        "compliant": "differs from lzb only where contacts have gaps, or open and close again (as "
+        "compliant": "differs from lzb only where contacts have gaps, or open and "
+        "close again (as "
         "at a wall): name it in `laws` to fit it, too",
-        "routh": "is moreau with one restitution, unless contacts separate beforehand: name it in "
+        "routh": "is moreau with one restitution, unless contacts separate beforehand: "
+        "name it in "
         "`laws` to fit it, too",
     }
     if any(map(_opens_and_closes, scenes)):
@@ -371,17 +439,25 @@ def _candidates(
 
 
 def _opens_and_closes(scene: Scene) -> bool:
-    """True where gaps matter: a contact is open, or a wall lets contacts open and close again."""
+    """True where gaps matter: a contact is open, or a wall lets contacts open and close
+    again.
+    """
     return not np.all(scene.closed) or (scene.walls is not None and any(scene.walls))
 
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
-    """The free parameters of a user's law: those by default, and those of `more` that it has."""
+    """The free parameters of a user's law: those by default, and those of `more` that
+    it has.
+    """
     available = free_parameters_of(law)
-    return dict.fromkeys((*default_free(law), *(name for name in more if name in available)), True)
+    return dict.fromkeys(
+        (*default_free(law), *(name for name in more if name in available)), True
+    )
 
 
-def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> dict[str, Candidate]:
+def _variants(
+    law: Law, contacts: int, alike: bool, more: tuple[str, ...]
+) -> dict[str, Candidate]:
     """Candidates of a law, by the ending of their names, which share one program.
 
     One restitution for all contacts, or one for each; stiffness ratios fixed, or free.
@@ -404,10 +480,12 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
         law = with_parameter(law, name, each)
     # labels of `free`: equal numbers share one value, 0 is fixed
     each_own = np.arange(1, contacts + 1)
-    coefficients, ratios = {"": np.ones(contacts, int)}, {"": np.zeros(contacts, int)}
+    coefficients = {"": np.ones(contacts, int)}
+    ratios = {"": np.zeros(contacts, int)}
     if alike:
         coefficients[", e per contact"] = each_own
-    if alike and law.only_stiffness_ratios:  # of others the stiffness is one in SI units
+    # of others the stiffness is one in SI units
+    if alike and law.only_stiffness_ratios:
         ratios[", free stiffness ratios"] = each_own
     return {
         f"{a}{b}": (law, dict(zip(fields, (e, k))) | others)
@@ -416,31 +494,40 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
     }
 
 
-# ------------------------------------------------------------------------------- the evidence
+# ------------------------------------------------------------------------------- the
+# evidence
 
 
 def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
-    """The laws by name in order, with verdicts: `_verdict_alone`, then against the best law.
+    """The laws by name in order, with verdicts: `_verdict_alone`, then against the best
+    law.
 
-    The best has the least sum of squared errors in shots left out; of fewer than `_LEAST` shots,
-    the least variance of the residuals.
+    The best has the least sum of squared errors in shots left out; of fewer than
+    `_LEAST` shots, the least variance of the residuals.
     """
     errors = {name: _errors_left_out(each) for name, each in fits.items()}
     against = {name: _verdict_alone(each) for name, each in fits.items()}
     squares = {name: _per_shot(each, errors[name]) for name, each in fits.items()}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     by_shots = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
-    error = {n: np.nansum(squares[n]) if by_shots else _variance(fits[n]) for n in usable}
+    error = {
+        n: np.nansum(squares[n]) if by_shots else _variance(fits[n]) for n in usable
+    }
     best = min(usable, key=lambda name: (error[name], len(fits[name].names)))
     entries = []
     for name, each in fits.items():
         tier, verdict = against[name]
         if by_shots:
-            chance, level = _paired_p_value(squares[name], squares[best]), WORSE
+            chance = _paired_p_value(squares[name], squares[best])
+            level = WORSE
         else:
-            chance, level = _f_test_of_residuals(each, fits[best]), WORSE_OF_FEW
+            chance = _f_test_of_residuals(each, fits[best])
+            level = WORSE_OF_FEW
         if tier != "fails" and chance < level:
-            verb = "predicts" if by_shots else "fits"
+            if by_shots:
+                verb = "predicts"
+            else:
+                verb = "fits"
             worse = f"{verb} worse than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
         rms = each.problem.rms(errors[name])
@@ -449,10 +536,20 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
 
 
 def _sort_key(entry: LawFit) -> tuple[Any, ...]:
-    """Sort key: tier, then number of parameters (of worse tiers: error), then order of `advise`."""
-    tier, base, order = _TIERS.index(entry.tier), entry.name.split(",")[0], simplest_first()
-    place = order.index(base) if base in order else len(order)
-    error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
+    """Sort key: tier, then number of parameters (of worse tiers: error), then order of
+    `advise`.
+    """
+    tier = _TIERS.index(entry.tier)
+    base = entry.name.split(",")[0]
+    order = simplest_first()
+    if base in order:
+        place = order.index(base)
+    else:
+        place = len(order)
+    if np.isfinite(entry.left_out_error):
+        error = entry.left_out_error
+    else:
+        error = entry.fit.rms
     return tier, entry.parameters if tier < 2 else error, place
 
 
@@ -461,18 +558,25 @@ def _verdict_alone(result: Fit) -> tuple[str, str]:
     failing = [STATUS[code].name for code in result.status if STATUS[code].failure]
     if failing:
         names = ", ".join(dict.fromkeys(failing))
-        return "fails", f"fails in {len(failing)} of {len(result.status)} shots: {names}"
+        return (
+            "fails",
+            f"fails in {len(failing)} of {len(result.status)} shots: {names}",
+        )
     if not result.converged:
         return "fails", "does not converge"
     if result.shows_lack_of_fit:
         return "lack of fit", "lack of fit"
     if result.rank < len(result.names):
-        return "fits", f"fits, {result.rank} of {len(result.names)} parameters determined"
+        return (
+            "fits",
+            f"fits, {result.rank} of {len(result.names)} parameters determined",
+        )
     return "fits", "fits"
 
 
 def _errors_left_out(result: Fit) -> np.ndarray:
-    """Errors (K, n) of predictions of each shot from a fit to the others; NaN for a single shot.
+    """Errors (K, n) of predictions of each shot from a fit to the others; NaN for a
+    single shot.
 
     By a fit without each; of more than `FEW` shots, linearized.
     """
@@ -484,10 +588,11 @@ def _errors_left_out(result: Fit) -> np.ndarray:
 
 
 def _linearized(result: Fit) -> np.ndarray:
-    """Errors (K, n) of predictions of each shot from the others, by one Gauss-Newton step.
+    """Errors (K, n) of predictions of each shot from the others, by one Gauss-Newton
+    step.
 
-    Equation: `(I - H_kk)^-1 r_k` with blocks `H_kk = J_k (J^T J)^-1 J_k^T` of the hat matrix, in
-    independent residuals.
+    Equation: `(I - H_kk)^-1 r_k` with blocks `H_kk = J_k (J^T J)^-1 J_k^T` of the hat
+    matrix, in independent residuals.
     """
     jacobian, residual = map(
         result.problem.measurement.independent, (result.jacobian, result.residual)
@@ -496,21 +601,26 @@ def _linearized(result: Fit) -> np.ndarray:
     inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
     hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
     complement = np.eye(hat.shape[-1]) - hat
-    error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(complement, residual)])
+    error = np.stack(
+        [np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(complement, residual)]
+    )
     return result.problem.measurement.errors_of(error)
 
 
 def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
-    """Sums of squares (K,) of the errors of each shot, over sigma; NaN where a shot has none."""
+    """Sums of squares (K,) of the errors of each shot, over sigma; NaN where a shot has
+    none.
+    """
     squares = np.sum(result.problem.measurement.independent(error) ** 2, axis=1)
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 
 def _paired_p_value(squares: np.ndarray, best: np.ndarray) -> float:
-    """p-value of the hypothesis that a law predicts as well as the best: paired t tests over shots.
+    """p-value of the hypothesis that a law predicts as well as the best: paired t tests
+    over shots.
 
-    The smaller one of two: of the squared errors (K,), and of their logarithms, which a few large
-    ones do not dominate.
+    The smaller one of two: of the squared errors (K,), and of their logarithms, which a
+    few large ones do not dominate.
     """
     both = np.isfinite(squares) & np.isfinite(best)
     positive = both & (squares > 0) & (best > 0)
@@ -519,7 +629,8 @@ def _paired_p_value(squares: np.ndarray, best: np.ndarray) -> float:
 
 
 def _t_test(more: np.ndarray, size: Any) -> float:
-    """p-value of the one-sided t test that the mean of `more` is 0: `t = mean / (std / sqrt(N))`.
+    """p-value of the one-sided t test that the mean of `more` is 0:
+    `t = mean / (std / sqrt(N))`.
 
     Values below `SAME size` count as 0: rounding.
     """
@@ -533,43 +644,63 @@ def _t_test(more: np.ndarray, size: Any) -> float:
 
 
 def _variance(result: Fit) -> float:
-    """Variance of the residuals, |r|^2 / f; infinite where no degree of freedom f is left."""
+    """Variance of the residuals, |r|^2 / f; infinite where no degree of freedom f is
+    left.
+    """
     freedom = result.degrees_of_freedom
-    return result.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
+    if freedom > 0:
+        return result.starts[0].sum_of_squares / freedom
+    return np.inf
 
 
 def _f_test_of_residuals(result: Fit, best: Fit) -> float:
     """p-value of an F test of the residuals of a law against those of the best one.
 
-    The best one counts as having one parameter more at least; 1 where its residuals are larger.
+    The best one counts as having one parameter more at least; 1 where its residuals are
+    larger.
     """
     gain = result.starts[0].sum_of_squares - best.starts[0].sum_of_squares
     more = max(best.rank - result.rank, 1)
-    return _f_test(gain, more, best).chance if gain > 0 else 1.0
+    if gain > 0:
+        return _f_test(gain, more, best).chance
+    return 1.0
 
 
 def _aicc(result: Fit) -> float:
-    """Akaike's criterion, where sigma is unknown corrected for small samples; NaN if meaningless.
+    """Akaike's criterion, where sigma is unknown corrected for small samples; NaN if
+    meaningless.
 
-    Equation: `AIC + 2 k (k + 1) / (n - k - 1)`, n values, k parameters with the noise. It has a
-    meaning for a converged fit of full rank, inside its bounds, to all shots.
+    Equation: `AIC + 2 k (k + 1) / (n - k - 1)`, n values, k parameters with the noise.
+    It has a meaning for a converged fit of full rank, inside its bounds, to all shots.
     """
-    n, count = result.problem.values, len(result.names)
-    regular = result.rank == count and not result.at_bound.any() and not result.problem.left_out
+    n = result.problem.values
+    count = len(result.names)
+    regular = (
+        result.rank == count
+        and not result.at_bound.any()
+        and not result.problem.left_out
+    )
     if not regular or not result.converged:
         return np.nan
     if result.problem.sigma is not None:
         return result.aic
     k = count + 1  # and the noise
-    return result.aic + 2 * k * (k + 1) / (n - k - 1) if n - k - 1 >= 1 else np.nan
+    if n - k - 1 >= 1:
+        return result.aic + 2 * k * (k + 1) / (n - k - 1)
+    return np.nan
 
 
 def _speed_test(
-    constant: Fit, candidate: Candidate, scene: Scene | None, data: Experiments, options: Any
+    constant: Fit,
+    candidate: Candidate,
+    scene: Scene | None,
+    data: Experiments,
+    options: Any,
 ) -> tuple[NestedTest | None, Fit | None]:
     """Test of a restitution that depends on the speed, and the fit with it.
 
-    None for laws without a restitution or with such a dependence, and for shots of one speed.
+    None for laws without a restitution or with such a dependence, and for shots of one
+    speed.
 
     Args:
         constant: the fit without it.
@@ -579,12 +710,17 @@ def _speed_test(
         options: of `fit`.
     """
     law, free = candidate
-    available, speeds = free_parameters_of(law), data.approach_speed(scene)
+    available = free_parameters_of(law)
+    speeds = data.approach_speed(scene)
     speeds = speeds[speeds > 0]
     constant_e = "restitution" in available and not available.keys() & set(OF_SPEED)
     if not constant_e or len(speeds) < 2 or np.ptp(speeds) == 0:
         return None, None
     typical = float(np.exp(np.mean(np.log(speeds))))
-    falling = VelocityDependent(law, speed_exponent=SPEED_EXPONENT, reference_speed=typical)
+    falling = VelocityDependent(
+        law, speed_exponent=SPEED_EXPONENT, reference_speed=typical
+    )
     full = fit(falling, scene, data, {**free, "speed_exponent": True}, **options)
-    return (nested_test(constant, full), full) if full.rank > constant.rank else (None, None)
+    if full.rank > constant.rank:
+        return (nested_test(constant, full), full)
+    return (None, None)

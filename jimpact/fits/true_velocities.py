@@ -1,4 +1,6 @@
-"""The true velocities before impacts that agree best with law and data, and the law there."""
+"""The true velocities before impacts that agree best with law and data, and the law
+there.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,12 +17,13 @@ from jimpact.fits.measurement import Measurement
 from jimpact.fits.observables import Prediction, Shots
 from jimpact.tools.compiling import full_precision
 
-# True velocities stay where a step moves none by more than this many of its standard errors: the
-# misfit, at its least there, is right to the square of it. Ten times more: parameters move by a
-# ten-thousandth of a standard error between builds; in float32 that is what rounding leaves.
+# True velocities stay where a step moves none by more than this many of its standard
+# errors: the misfit, at its least there, is right to the square of it. Ten times more:
+# parameters move by a ten-thousandth of a standard error between builds; in float32
+# that is what rounding leaves.
 STAYS = {"float64": 1e-7, "float32": 1e-3}
-# Steps at most: two suffice for a law that is linear in v-, some five for a smooth one. Ten times
-# more: true velocities that a kink of the law sends to and fro take as many.
+# Steps at most: two suffice for a law that is linear in v-, some five for a smooth one.
+# Ten times more: true velocities that a kink of the law sends to and fro take as many.
 MOST_STEPS = 16
 # ... from this one on they go half of the way, which ends most of such cycles.
 HALF_STEPS_FROM = 6
@@ -35,8 +38,8 @@ class LawAtShots(NamedTuple):
         by_parameters: `G = df/dx` at a.
         by_velocities: `J = df/da`.
         status: codes of the impacts at a.
-        residual: independent residuals `F^-1 (predicted - measured) / sigma`; 0 of values that were
-            not measured.
+        residual: independent residuals `F^-1 (predicted - measured) / sigma`; 0 of
+            values that were not measured.
         jacobian: `F^-1 G / sigma`, its derivatives in x.
         moved: the largest change of a in the last step, over its standard error.
     """
@@ -52,7 +55,9 @@ class LawAtShots(NamedTuple):
 
 
 class _Iteration(NamedTuple):
-    """Steps so far, the true velocities of the next one, and the law at those of the last one."""
+    """Steps so far, the true velocities of the next one, and the law at those of the
+    last one.
+    """
 
     steps: Int[Array, ""]
     pre: Float[Array, "K n"]
@@ -67,11 +72,13 @@ def law_at_shots(
     measurement: Measurement,
     before: ErrorsBefore,
 ) -> LawAtShots:
-    """The law at parameters x, linearized at the true velocities that agree best with it.
+    """The law at parameters x, linearized at the true velocities that agree best with
+    it.
 
-    Equation: `a = argmin (x - a, y - f(a)) S^-1 (x - a, y - f(a))^T` for measured velocities x and
-    y of each shot, by Gauss-Newton steps (`errors_before`) from the measured v-. Shots whose
-    outcome is meaningless stay where they are; their residual is that of `Measurement.error`.
+    Equation: `a = argmin (x - a, y - f(a)) S^-1 (x - a, y - f(a))^T` for measured
+    velocities x and y of each shot, by Gauss-Newton steps (`errors_before`) from the
+    measured v-. Shots whose outcome is meaningless stay where they are; their residual
+    is that of `Measurement.error`.
 
     Args:
         law_of: the law of parameters.
@@ -85,15 +92,23 @@ def law_at_shots(
     error_before = jnp.asarray(before.standard_errors(measured.shape))
     n = observe.bodies
 
-    def outcome(moved: Float[Array, " X+n"], pre: Float[Array, "K n"]) -> tuple[Any, Prediction]:
-        """v+ at (parameters, change of all v- from `pre`), to be differentiated, and as it is."""
+    def outcome(
+        moved: Float[Array, " X+n"], pre: Float[Array, "K n"]
+    ) -> tuple[Any, Prediction]:
+        """v+ at (parameters, change of all v- from `pre`), to be differentiated, and as
+        it is.
+        """
         parameters = moved[:-n]
         velocities = jnp.asarray(observe.pre).at[:, :n].set(pre + moved[None, -n:])
-        prediction = eqx.tree_at(lambda shots: shots.pre, observe, velocities)(law_of(parameters))
+        prediction = eqx.tree_at(lambda shots: shots.pre, observe, velocities)(
+            law_of(parameters)
+        )
         return prediction.value, prediction
 
     def at(pre: Float[Array, "K n"]) -> tuple[LawAtShots, Float[Array, "K n"]]:
-        """The law linearized at true velocities, and the true velocities that follow."""
+        """The law linearized at true velocities, and the true velocities that
+        follow.
+        """
         start = jnp.concatenate([x, jnp.zeros(n, x.dtype)])
         slopes, prediction = jax.jacfwd(partial(outcome, pre=pre), has_aux=True)(start)
         identity = jnp.eye(n, dtype=x.dtype)[None]
@@ -138,7 +153,11 @@ def law_at_shots(
     return jax.lax.while_loop(goes_on, step, first).law
 
 
-def _largest(change: Float[Array, "K n"], error: Float[Array, "K n"]) -> Float[Array, ""]:
-    """The largest change over its standard error; exact velocities, of error 0, stay."""
+def _largest(
+    change: Float[Array, "K n"], error: Float[Array, "K n"]
+) -> Float[Array, ""]:
+    """The largest change over its standard error; exact velocities, of error 0,
+    stay.
+    """
     uncertain = error > 0
     return jnp.max(jnp.where(uncertain, change / jnp.where(uncertain, error, 1.0), 0.0))

@@ -28,14 +28,19 @@ __all__ = [
 # entries by key: each begins @kind{key,
 _BIBTEX = {
     entry[entry.index("{") + 1 : entry.index(",")]: entry
-    for entry in (files("jimpact") / "data" / "laws.bib").read_text().strip().split("\n\n")
+    for entry in (files("jimpact") / "data" / "laws.bib")
+    .read_text()
+    .strip()
+    .split("\n\n")
 }
 
 register(
     "lzb",
     LZB,
     summary="energetic restitution, distributed by the stiffness ratios",
-    right_when="local, rate-independent contacts with known stiffness ratios (touching beads)",
+    right_when=(
+        "local, rate-independent contacts with known stiffness ratios (touching beads)"
+    ),
     fails_when="bulk waves (rods), viscous contacts, gaps that must re-close, adhesion",
     promises=EVERY_PROPERTY,
     source="Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.67)-(6.73)",
@@ -58,7 +63,9 @@ register(
     Moreau,
     summary="0 <= gamma+ + e gamma- and p >= 0, one of them zero",
     right_when="stiffness rising along the chain, plastic or decoupled contacts",
-    fails_when="chains at rest (no dispersion), contacts that separate before the impact",
+    fails_when=(
+        "chains at rest (no dispersion), contacts that separate before the impact"
+    ),
     promises={"impulse_sign", "velocity_scaling", "mass_scaling"},
     source="Moreau (1988); Brogliato (2016), (6.51)",
     bibtex=_BIBTEX["moreau1988"],
@@ -80,10 +87,13 @@ register(
     Binary,
     summary="pair collisions one after another, in a given order",
     right_when="gaps well above the indentation, stiffness falling along the chain",
-    fails_when="touching equal balls (the striker never reverses), collisions at the same instant, "
+    fails_when="touching equal balls (the striker never reverses), collisions at the "
+    "same instant, "
     "whose order then decides",
     promises=EVERY_PROPERTY,
-    source="Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)",
+    source=(
+        "Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)"
+    ),
     bibtex=_BIBTEX["towne1977"],
     simplicity=4,
 )
@@ -91,8 +101,12 @@ register(
     "restitution_matrix",
     RestitutionMatrix,
     summary="qn+ = -E qn-: a full matrix of coefficients, tangential blocks included",
-    right_when="E is known or fitted for this very system and kind of approach; rocking",
-    fails_when="other masses or geometry than E was found for; E outside the admissible set",
+    right_when=(
+        "E is known or fitted for this very system and kind of approach; rocking"
+    ),
+    fails_when=(
+        "other masses or geometry than E was found for; E outside the admissible set"
+    ),
     promises={"velocity_scaling", "mass_scaling"},
     source="Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)",
     bibtex=_BIBTEX["brogliato2016"],
@@ -102,7 +116,9 @@ register(
     Compliant,
     summary="springs and dampers between bodies with real gaps",
     right_when="gaps near the indentation, viscous contacts, known absolute stiffness",
-    fails_when="stiffness and damping unknown in SI units; geometry that turns during contact",
+    fails_when=(
+        "stiffness and damping unknown in SI units; geometry that turns during contact"
+    ),
     promises={"impulse_sign", "gap_velocity_sign", "energy"},
     source="Brogliato (2016), (6.14)-(6.16); forces as cited in `jimpact.laws.forces`",
     bibtex=_BIBTEX["brogliato2016"],
@@ -113,9 +129,13 @@ register(
 register(
     "routh",
     Routh,
-    summary="impulses grow in constant ratios, one energetic e for the work of all contacts",
+    summary=(
+        "impulses grow in constant ratios, one energetic e for the work of all contacts"
+    ),
     right_when="contacts that all approach, alike in material",
-    fails_when="chains at rest (no dispersion), unequal e, contacts that separate beforehand",
+    fails_when=(
+        "chains at rest (no dispersion), unequal e, contacts that separate beforehand"
+    ),
     promises={"impulse_sign", "energy", "velocity_scaling", "mass_scaling"},
     source="Bowling and Rodriguez; Brogliato (2016), 6.4.3",
     bibtex=_BIBTEX["routh1897"],
@@ -125,7 +145,10 @@ register(
     ImpulseCorrelation,
     summary="contacts beside a collision get a constant multiple of its impulse",
     right_when="a scene and an approach for which the ratio was measured or fitted",
-    fails_when="another approach or stiffness: impulse ratios vary; both sides approach at once",
+    fails_when=(
+        "another approach or stiffness: impulse ratios vary; both sides "
+        "approach at once"
+    ),
     promises={"velocity_scaling", "mass_scaling", "energy", "impulse_sign"},
     source="Ceanga and Hurmuzlu (2001); Brogliato (2016), 6.4.3",
     bibtex=_BIBTEX["ceanga2001"],
@@ -133,11 +156,17 @@ register(
 register(
     "velocity_dependent",
     VelocityDependent,
-    summary="a law by name (`base`) whose e falls with the speed, and is 1 below the yield speed",
+    summary=(
+        "a law by name (`base`) whose e falls with the speed, and is 1 below the "
+        "yield speed"
+    ),
     right_when="shots of very different speeds, metals above their yield",
     fails_when="all shots equally fast: e and its exponent cannot be distinguished",
     promises=(),  # those of its base, but scaling with the velocity
-    source="Brogliato, Nonsmooth Mechanics (2016), 6.3.1; Johnson, Contact Mechanics (1985), 11.5",
+    source=(
+        "Brogliato, Nonsmooth Mechanics (2016), 6.3.1; Johnson, Contact Mechanics "
+        "(1985), 11.5"
+    ),
     bibtex=_BIBTEX["johnson1985"],
     make=make_velocity_dependent,
 )

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.contact import Contact
-from jimpact.core.law import Impulses, Law, OptionalValues, Values, check_law, option, parameter
+from jimpact.core.law import (
+    Impulses,
+    Law,
+    OptionalValues,
+    Values,
+    check_law,
+    option,
+    parameter,
+)
 from jimpact.core.scene import Scene, as_velocity, velocity_change
 from jimpact.laws import collisions
 from jimpact.laws.friction import friction_fields
@@ -28,7 +36,9 @@ def _checked_order(order: Any) -> str | tuple[int, ...]:
             f"Argument `order` must be one of {ORDERS} or a tuple of contact indices, "
             f"but has value {order!r}."
         )
-    bad = [j for j in order if isinstance(j, bool) or not hasattr(j, "__index__") or j < 0]
+    bad = [
+        j for j in order if isinstance(j, bool) or not hasattr(j, "__index__") or j < 0
+    ]
     if bad:
         raise ValueError(
             f"Argument `order` must hold contact indices >= 0, but has value {order!r}."
@@ -45,33 +55,40 @@ class Binary(Law):
     Args:
         restitution: kinematic coefficient e in [0, 1], scalar or one per contact (m,).
         order: 'fastest': the contact with the largest approach speed [m/s];
-            'earliest': the one that closes first (gap / approach speed), gaps change in free
-            flight between collisions (None: all closed), ties are decided by 'fastest';
-            'left_to_right': contacts 0 .. m-1 in turn, again and again;
-            a tuple of all contact indices (0-based, repeats allowed): in turn, likewise. Contacts
-            that do not approach are skipped.
+            'earliest': the one that closes first (gap / approach speed), gaps change in
+            free flight between collisions (None: all closed), ties are decided by
+            'fastest'; 'left_to_right': contacts 0 .. m-1 in turn, again and again;
+            a tuple of all contact indices (0-based, repeats allowed): in turn,
+            likewise. Contacts that do not approach are skipped.
         max_collisions: largest number of collisions before the law gives up.
-        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
-        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `u+ = -e_t u-`.
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no
+            friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is
+            `u+ = -e_t u-`.
 
-    With friction each collision is one contact's: `p_t in -mu p Sgn(u+ + e_t u-)`, u its slip
-    velocity; it may set its neighbours in motion, along and across. In every order but 'earliest'
-    gap sizes do not matter: open contacts that approach collide too.
+    With friction each collision is one contact's: `p_t in -mu p Sgn(u+ + e_t u-)`, u
+    its slip velocity; it may set its neighbours in motion, along and across. In every
+    order but 'earliest' gap sizes do not matter: open contacts that approach collide
+    too.
 
-    Status: `order_dependent` where two coupled contacts were equally fast (early) within rounding
-    (the lower index went first); `plastic_limit` where collisions go on forever: for two contacts
-    exactly iff z >= 1 and the state is in the invariant cone, gamma+ = 0 then; for more where
-    approach speeds decay below rounding without ending; `max_steps` at `max_collisions`.
+    Status: `order_dependent` where two coupled contacts were equally fast (early)
+    within rounding (the lower index went first); `plastic_limit` where collisions go on
+    forever: for two contacts exactly iff z >= 1 and the state is in the invariant cone,
+    gamma+ = 0 then; for more where approach speeds decay below rounding without ending;
+    `max_steps` at `max_collisions`.
 
-    Derivatives, forward and reverse, in restitution, W and gamma-, at the order of collisions that
-    occurs. v+ is continuous where the number of collisions changes, with one-sided derivatives; it
-    jumps where the order of coupled contacts changes. Derivatives in gaps are zero.
+    Derivatives, forward and reverse, in restitution, W and gamma-, at the order of
+    collisions that occurs. v+ is continuous where the number of collisions changes,
+    with one-sided derivatives; it jumps where the order of coupled contacts changes.
+    Derivatives in gaps are zero.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.3), (6.4), (6.13) corrected, (6.17)-(6.21);
-    Towne and Hadlock, Am. J. Phys. 45 (1977) 255 (number of collisions).
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.3), (6.4), (6.13) corrected,
+    (6.17)-(6.21); Towne and Hadlock, Am. J. Phys. 45 (1977) 255 (number of collisions).
 
     >>> import jimpact as ji
-    >>> out = ji.impact(ji.Binary([0.9, 0.8]), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
+    >>> out = ji.impact(
+    ...     ji.Binary([0.9, 0.8]), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0]
+    ... )
     >>> [round(float(v), 6) for v in out.velocity]
     [-0.266667, -0.050667, 0.456]
     """
@@ -79,8 +96,12 @@ class Binary(Law):
     uses_gaps: ClassVar[bool] = True
 
     restitution: Values = parameter(low=0.0, high=1.0)
-    order: str | tuple[int, ...] = option("fastest", converter=_checked_order, kw_only=False)
-    max_collisions: int = option(10_000, converter=lambda n: as_whole("max_collisions", n, 1))
+    order: str | tuple[int, ...] = option(
+        "fastest", converter=_checked_order, kw_only=False
+    )
+    max_collisions: int = option(
+        10_000, converter=lambda n: as_whole("max_collisions", n, 1)
+    )
     friction: OptionalValues = parameter(low=0.0)
     tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
 
@@ -93,16 +114,22 @@ class Binary(Law):
         friction: Any = None,
         tangential_restitution: Any = 0.0,
     ):
-        """Set the fields; their declarations check them. Without friction e_t must be 0."""
-        self.restitution, self.order, self.max_collisions = restitution, order, max_collisions
+        """Set the fields; their declarations check them. Without friction e_t must be
+        0.
+        """
+        self.restitution = restitution
+        self.order = order
+        self.max_collisions = max_collisions
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
         )
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError for an `order` with contacts that do not exist, are missing or repeat.
+        """Raise a ValueError for an `order` with contacts that do not exist, are
+        missing or repeat.
 
-        A contact may be named several times, but not twice in a row: it separates at once.
+        A contact may be named several times, but not twice in a row: it separates at
+        once.
         """
         if isinstance(self.order, str):
             return
@@ -115,13 +142,18 @@ class Binary(Law):
         missing = sorted(set(range(m)) - set(self.order))
         if missing:
             raise ValueError(
-                f"Argument `order` must name every contact, but contact {missing[0]} is missing "
+                f"Argument `order` must name every contact, but contact {missing[0]} "
+                f"is missing "
                 f"in {self.order!r} and could approach forever."
             )
-        if m > 1 and any(a == b for a, b in zip(self.order, self.order[1:] + self.order[:1])):
+        if m > 1 and any(
+            a == b for a, b in zip(self.order, self.order[1:] + self.order[:1])
+        ):
             raise ValueError(
-                "Argument `order` must not name a contact twice in a row (the last and the first "
-                f"follow each other), but has value {self.order!r}: it separates at once."
+                "Argument `order` must not name a contact twice in a row (the last and "
+                "the first "
+                f"follow each other), but has value {self.order!r}: it separates at "
+                f"once."
             )
 
     @full_precision
@@ -131,30 +163,43 @@ class Binary(Law):
         return Impulses(p, tangential, end.code)
 
     def _cycle(self, m: int) -> tuple[int, ...] | None:
-        """Indices of the m contacts in cyclic order; None: the fastest or earliest one is next."""
+        """Indices of the m contacts in cyclic order; None: the fastest or earliest one
+        is next.
+        """
         if isinstance(self.order, tuple):
             return self.order
-        return tuple(range(m)) if self.order == "left_to_right" else None
+        if self.order == "left_to_right":
+            return tuple(range(m))
+        return None
 
     def _gaps(self, gaps: jax.Array | None, gamma: jax.Array) -> jax.Array | None:
-        """Gaps (m,) [m] in the order 'earliest', 0 where none are given; None in other orders."""
+        """Gaps (m,) [m] in the order 'earliest', 0 where none are given; None in other
+        orders.
+        """
         if self.order != "earliest":
             return None
-        return jnp.zeros_like(gamma) if gaps is None else gaps
+        if gaps is None:
+            return jnp.zeros_like(gamma)
+        return gaps
 
     def _friction(self, contact: Contact) -> collisions.CoulombFriction | None:
         """The tangential block with mu and e_t (m,); None without friction."""
-        mu, e_t = self.friction, self.tangential_restitution
+        mu = self.friction
+        e_t = self.tangential_restitution
         if mu is None or e_t is None:
             return None
         assert contact.tangential_block is not None  # see `check_law`
         ones = jnp.ones_like(contact.gap_velocity)
-        return collisions.CoulombFriction(contact.tangential_block, mu * ones, e_t * ones)
+        return collisions.CoulombFriction(
+            contact.tangential_block, mu * ones, e_t * ones
+        )
 
     def _solve(
         self, contact: Contact
     ) -> tuple[jax.Array, jax.Array | None, collisions.SequenceEnd]:
-        """Impulses p (m,), p_t (t,) [N s], with the status code and number of collisions."""
+        """Impulses p (m,), p_t (t,) [N s], with the status code and number of
+        collisions.
+        """
         gamma = contact.gap_velocity
         return collisions.solve(
             contact.delassus,
@@ -167,12 +212,14 @@ class Binary(Law):
         )
 
     def collisions(self, scene: Scene, velocity: Any) -> jax.Array:
-        """Number of collisions () int32 of a scene and velocity v- (n,) [m/s]; -1: endless.
+        """Number of collisions () int32 of a scene and velocity v- (n,) [m/s]; -1:
+        endless.
 
-        `max_collisions` where the law gave up. Approaches slower than rounding do not count.
+        `max_collisions` where the law gave up. Approaches slower than rounding do not
+        count.
 
-        Source: Brogliato (2016), (6.19), (6.20) with ceil for floor: three balls, v- = (v, 0, 0),
-        have `N = ceil(pi / arccos z) - 1`.
+        Source: Brogliato (2016), (6.19), (6.20) with ceil for floor: three balls, v- =
+        (v, 0, 0), have `N = ceil(pi / arccos z) - 1`.
 
         >>> import jimpact as ji
         >>> int(ji.Binary(0.5).collisions(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]))
@@ -184,7 +231,8 @@ class Binary(Law):
     def sequence(
         self, scene: Scene, velocity: Any, limit: int = 100
     ) -> list[tuple[int, float | None, np.ndarray]]:
-        """The first `limit` collisions: contact, time [s] ('earliest', else None), velocities.
+        """The first `limit` collisions: contact, time [s] ('earliest', else None),
+        velocities.
 
         Args:
             scene: n coordinates, m contacts.
@@ -203,23 +251,41 @@ class Binary(Law):
         """
         law, scene, v = self._prepared(scene, velocity)
         contact = law.contact(scene, v)
-        w, gamma = contact.delassus, contact.gap_velocity
+        w = contact.delassus
+        gamma = contact.gap_velocity
         gaps = law._gaps(contact.gaps, gamma)
-        inputs = collisions.to_inputs(w, gamma, law.restitution, gaps, law._friction(contact))
+        inputs = collisions.to_inputs(
+            w, gamma, law.restitution, gaps, law._friction(contact)
+        )
         cycle = law._cycle(scene.contacts)
-        options = collisions.Options(cycle, self.max_collisions, isinstance(w, Tridiagonal))
-        g, at = collisions.coupling_matrix(inputs, options), collisions.begin(inputs)
+        options = collisions.Options(
+            cycle, self.max_collisions, isinstance(w, Tridiagonal)
+        )
+        g = collisions.coupling_matrix(inputs, options)
+        at = collisions.begin(inputs)
         steps: list[tuple[int, float | None, np.ndarray]] = []
-        while len(steps) < min(limit, self.max_collisions) and collisions.approaches(inputs, at):
-            before, at = at, _collide(inputs, options, g, at)
+        while len(steps) < min(limit, self.max_collisions) and collisions.approaches(
+            inputs, at
+        ):
+            before = at
+            at = _collide(inputs, options, g, at)
             j = int(jnp.argmax(at.p - before.p))  # only this contact gained an impulse
-            time = float(at.time) if law.order == "earliest" else None
+            if law.order == "earliest":
+                time = float(at.time)
+            else:
+                time = None
             p, tangential = collisions.impulses_of(at.p, at.tangential, inputs.root)
-            steps.append((j, time, np.asarray(v + velocity_change(scene, p, tangential))))
+            steps.append(
+                (j, time, np.asarray(v + velocity_change(scene, p, tangential)))
+            )
         return steps
 
-    def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
-        """The law, the scene and v- (n,) [m/s], checked and in one floating-point type."""
+    def _prepared(
+        self, scene: Scene, velocity: Any
+    ) -> tuple["Binary", Scene, jax.Array]:
+        """The law, the scene and v- (n,) [m/s], checked and in one floating-point
+        type.
+        """
         v = as_velocity(scene, velocity)
         check_values("velocity", v)
         law, scene, v = in_common_dtype(self, scene, v)

@@ -1,10 +1,13 @@
 """Sequential pair collisions in contact space, until no contact approaches.
 
-Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(W_jj) p` and G with
-unit diagonal. A collision at contact j adds `pbar_j += s_j` and `qn += G_j s_j`, with
-`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`. With friction it adds a
-tangential impulse, too: each collision is one contact's Coulomb problem (`friction.py`).
-With correlation ratios the closed contacts beside it get impulses in a given ratio to its own.
+Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(W_jj) p`
+and G with unit diagonal. A collision at contact j adds `pbar_j += s_j` and
+`qn += G_j s_j`, with
+`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`. With friction
+it adds a tangential impulse, too: each collision is one contact's Coulomb problem
+(`friction.py`).
+With correlation ratios the closed contacts beside it get impulses in a given ratio to
+its own.
 """
 
 from typing import NamedTuple
@@ -27,14 +30,15 @@ from jimpact.tools.loops import while_loop
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
-# eps, relative to the largest normalized approach velocity at the start: slower approaches are
-# rounding (no collision), and criteria closer than that are equal. Errors of the velocities grow
-# with the root of the number of collisions, so this covers some ten thousand; ten times more would
-# lose the last slow collisions of long sequences.
+# eps, relative to the largest normalized approach velocity at the start: slower
+# approaches are rounding (no collision), and criteria closer than that are equal.
+# Errors of the velocities grow with the root of the number of collisions, so this
+# covers some ten thousand; ten times more would lose the last slow collisions of long
+# sequences.
 REST = 128.0
-# Three or more contacts: a last collision slower than this (relative, as REST) that leaves an
-# approach is one of an endless sequence; what remains of it is below REST. Ten times more would cut
-# off sequences that end.
+# Three or more contacts: a last collision slower than this (relative, as REST) that
+# leaves an approach is one of an endless sequence; what remains of it is below REST.
+# Ten times more would cut off sequences that end.
 DECAYED = {"float64": 1e-9, "float32": 3e-4}
 
 
@@ -49,18 +53,22 @@ class CoulombFriction(NamedTuple):
 class Inputs(NamedTuple):
     """The normalized problem of a sequence of collisions."""
 
-    coupling: jax.Array  # entries of G above its unit diagonal, row by row; of a chain beside it
+    # entries of G above its unit diagonal, row by row; of a chain beside it
+    coupling: jax.Array
     restitution: jax.Array  # e () or (m,): a scalar costs one tangent, not m
     qn: jax.Array  # normalized gap velocities (m,)
     root: jax.Array  # sqrt(W_jj) (m,), only for comparisons
     gaps: jax.Array | None  # (m,) [m]; None: no free flight
     friction: CoulombFriction | None = None
-    # p_j of contacts beside the one that collides, over its p_i: (), (m,), or (m, m) in row i
+    # p_j of contacts beside the one that collides, over its p_i: (), (m,), or (m, m) in
+    # row i
     ratio: jax.Array | None = None
 
 
 class Options(NamedTuple):
-    """Static options: the cyclic order (None: fastest or earliest), the limit, a chain or not."""
+    """Static options: the cyclic order (None: fastest or earliest), the limit, a chain
+    or not.
+    """
 
     cycle: tuple[int, ...] | None
     max_collisions: int
@@ -89,7 +97,8 @@ class NextCollision(NamedTuple):
     contact: jax.Array  # () its index
     place: jax.Array  # () entry of a cyclic order after it
     wait: jax.Array  # () [s] of free flight until then
-    tied: jax.Array  # () True if a contact coupled with it could as well be the next one
+    # () True if a contact coupled with it could as well be the next one
+    tied: jax.Array
 
 
 class SequenceEnd(NamedTuple):
@@ -116,14 +125,18 @@ def solve(
         gamma: gap velocities before the impact (m,) [m/s].
         restitution: e, () or (m,).
         gaps: (m,) [m], which decide the order; None: no free flight.
-        cycle: contacts in cyclic order; None: the fastest one, with gaps the first to close.
+        cycle: contacts in cyclic order; None: the fastest one, with gaps the first to
+            close.
         max_collisions: largest number of collisions.
         friction: friction in SI units; None: none.
-        ratio: impulse correlation ratios, see `Inputs`; None: a collision is one contact's.
+        ratio: impulse correlation ratios, see `Inputs`; None: a collision is one
+            contact's.
 
     Differentiable in both modes.
     """
-    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(ratio=ratio)
+    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(
+        ratio=ratio
+    )
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
     (p, tangential), end = by_jacobian(lambda problem: run(problem, options), inputs)
     return *impulses_of(p, tangential, jnp.sqrt(diagonal(delassus))), end
@@ -145,9 +158,11 @@ def to_inputs(
     gaps: jax.Array | None,
     friction: CoulombFriction | None = None,
 ) -> Inputs:
-    """The normalized problem: `qn = gamma / d`, `G = W / (d d^T)`, `d_j = sqrt(W_jj)` (root).
+    """The normalized problem: `qn = gamma / d`, `G = W / (d d^T)`, `d_j = sqrt(W_jj)`
+    (root).
 
-    The fields `gaps` and `root` only decide the order of collisions, and have no derivatives.
+    The fields `gaps` and `root` only decide the order of collisions, and have no
+    derivatives.
     """
     root = jnp.sqrt(diagonal(delassus))
     g = scaled(delassus, 1 / root)
@@ -165,23 +180,29 @@ def to_inputs(
     )
 
 
-def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | None], SequenceEnd]:
-    """Normalized impulses (p (m,), p_t (t,)) of all collisions, and the end of the sequence.
+def run(
+    inputs: Inputs, options: Options
+) -> tuple[tuple[jax.Array, jax.Array | None], SequenceEnd]:
+    """Normalized impulses (p (m,), p_t (t,)) of all collisions, and the end of the
+    sequence.
 
-    Endless sequences end in the plastic limit, gamma = 0: of two contacts by `endless_pair`, of
-    more where speeds of collisions have decayed (`DECAYED`).
+    Endless sequences end in the plastic limit, gamma = 0: of two contacts by
+    `endless_pair`, of more where speeds of collisions have decayed (`DECAYED`).
     """
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
     pair = inputs.qn.shape[0] == 2 and inputs.friction is None and inputs.ratio is None
-    endless, limit = jnp.array(False), start.p
+    endless = jnp.array(False)
+    limit = start.p
     if pair:
         first = choose(inputs, options, g, start).contact
         endless, limit = endless_pair(inputs, first)
         endless = endless & approaches(inputs, start)
 
     def unfinished(at: CollisionState) -> jax.Array:
-        """True () if another collision follows, and the largest number is not reached."""
+        """True () if another collision follows, and the largest number is not
+        reached.
+        """
         return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
 
     end = while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
@@ -193,13 +214,19 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
     code = jnp.maximum(code, end.code)
     code = jnp.where(endless, CODE["plastic_limit"], code)
     code = jnp.where(stopped, CODE["max_steps"], code)
-    p = jnp.where(endless, limit, end.p) if pair else end.p
+    if pair:
+        p = jnp.where(endless, limit, end.p)
+    else:
+        p = end.p
     return (p, end.tangential), SequenceEnd(code, jnp.where(endless, -1, end.number))
 
 
 def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
-    """G (m, m) of its entries off the unit diagonal, `inputs.coupling`; tridiagonal for a chain."""
-    m, dtype = inputs.qn.shape[0], inputs.qn.dtype
+    """G (m, m) of its entries off the unit diagonal, `inputs.coupling`; tridiagonal for
+    a chain.
+    """
+    m = inputs.qn.shape[0]
+    dtype = inputs.qn.dtype
     if options.chain:
         return Tridiagonal(jnp.ones(m, dtype), inputs.coupling)
     i, j = jnp.triu_indices(m, 1)
@@ -236,17 +263,21 @@ def begin(inputs: Inputs) -> CollisionState:
         gaps=inputs.gaps,
         time=jnp.array(0, dtype),
         slip=None if inputs.friction is None else inputs.friction.block.slip,
-        tangential=None if inputs.friction is None else jnp.zeros_like(inputs.friction.block.slip),
+        tangential=None
+        if inputs.friction is None
+        else jnp.zeros_like(inputs.friction.block.slip),
         code=jnp.array(CODE["ok"], jnp.int32),
     )
 
 
-def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> NextCollision:
+def choose(
+    inputs: Inputs, options: Options, g: Symmetric, at: CollisionState
+) -> NextCollision:
     """The contact that collides next, at a state with contacts that approach.
 
-    In a cyclic order it is the next one that approaches. Else it is the fastest one [m/s], with
-    gaps among those that close first; the lowest index among equals within rounding, and `tied` if
-    one of these is coupled with it (G_ij != 0).
+    In a cyclic order it is the next one that approaches. Else it is the fastest one
+    [m/s], with gaps among those that close first; the lowest index among equals within
+    rounding, and `tied` if one of these is coupled with it (G_ij != 0).
     """
     rest = rest_of(inputs)
     approaching = at.qn < -rest
@@ -254,10 +285,13 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -
         cycle = jnp.array(options.cycle, jnp.int32)
         ready = approaching[cycle]  # entries whose contact approaches
         ahead = ready & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
-        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(ready)).astype(jnp.int32)
+        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(ready)).astype(
+            jnp.int32
+        )
         return NextCollision(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
     speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
-    rivals, wait = approaching, jnp.zeros_like(speed)
+    rivals = approaching
+    wait = jnp.zeros_like(speed)
     if at.gaps is not None:
         rivals, wait = first_to_close(inputs, at, approaching, speed)
     noise = rest * inputs.root
@@ -267,14 +301,18 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -
     chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
     floor = precision(speed.dtype).noise
     coupled = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
-    equals = rivals if at.gaps is not None else equally_fast
+    if at.gaps is not None:
+        equals = rivals
+    else:
+        equals = equally_fast
     return NextCollision(j, at.place, wait[j], jnp.any(equals & coupled & ~chosen))
 
 
 def first_to_close(
     inputs: Inputs, at: CollisionState, approaching: jax.Array, speed: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """True (m,) for the contacts that close first, within rounding, and times (m,) [s] until then.
+    """True (m,) for the contacts that close first, within rounding, and times (m,) [s]
+    until then.
 
     Equation: `t_j = gap_j / speed_j`, infinite for contacts that do not approach.
     """
@@ -294,18 +332,24 @@ def times(g: Symmetric, vector: jax.Array) -> jax.Array:
     return g @ vector
 
 
-def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> CollisionState:
+def collide(
+    inputs: Inputs, options: Options, g: Symmetric, at: CollisionState
+) -> CollisionState:
     """State after the free flight to the next collision and this collision.
 
-    Equation: impulse `s = -(1 + e_j) qn_j` at the contact j that collides, `qn += G_j s`; with
-    friction or correlation ratios impulses of `_with_friction`, `_correlated`.
+    Equation: impulse `s = -(1 + e_j) qn_j` at the contact j that collides,
+    `qn += G_j s`; with friction or correlation ratios impulses of `_with_friction`,
+    `_correlated`.
     """
     choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
-    slip, tangential, code = at.slip, at.tangential, at.code
+    slip = at.slip
+    tangential = at.tangential
+    code = at.code
     if inputs.ratio is not None:
         p, status = _correlated(inputs, inputs.ratio, g, at, chosen)
-        after, code = at.qn + times(g, p), jnp.maximum(code, status)
+        after = at.qn + times(g, p)
+        code = jnp.maximum(code, status)
     elif inputs.friction is None:
         p = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
         after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, p))
@@ -316,7 +360,8 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) 
         cross, tangent, _ = inputs.friction.block
         after = at.qn + times(g, p) + cross @ p_t
         slip = slip + cross.T @ p + tangent @ p_t
-        tangential, code = tangential + p_t, jnp.maximum(code, status)
+        tangential = tangential + p_t
+        code = jnp.maximum(code, status)
     gaps = at.gaps
     if gaps is not None:
         flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
@@ -337,16 +382,22 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) 
 
 
 def _correlated(
-    inputs: Inputs, ratio: jax.Array, g: Symmetric, at: CollisionState, chosen: jax.Array
+    inputs: Inputs,
+    ratio: jax.Array,
+    g: Symmetric,
+    at: CollisionState,
+    chosen: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Normalized impulses (m,) of a collision at the `chosen` contact and at those it presses.
+    """Normalized impulses (m,) of a collision at the `chosen` contact and at those it
+    presses.
 
-    They grow in constant ratios, `pbar = s d`: d_i = 1 at the chosen contact i (True in (m,)),
-    `d_j = r_j sqrt(W_jj / W_ii)` beside it, r = `ratio`. With a = G d contact j is compressed while
-    `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
+    They grow in constant ratios, `pbar = s d`: d_i = 1 at the chosen contact i (True in
+    (m,)), `d_j = r_j sqrt(W_jj / W_ii)` beside it, r = `ratio`. With a = G d contact j
+    is compressed while `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
     `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)` is that of kinetic energy:
-    `d.a s^2 / 2 + d.qn s + L = 0`, and s is the larger root. The status is `infeasible` where there
-    is none, or a contact is left approaching; then the chosen contact collides alone.
+    `d.a s^2 / 2 + d.qn s + L = 0`, and s is the larger root. The status is `infeasible`
+    where there is none, or a contact is left approaching; then the chosen contact
+    collides alone.
     """
     noise = precision(at.qn.dtype).noise
     own = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
@@ -358,8 +409,11 @@ def _correlated(
     a = times(g, d)
     closing = (d > 0) & (at.qn < 0)
     stays = closing & (a <= 0)  # it would be compressed for ever
-    stored = jnp.where(closing & ~stays, d * at.qn**2 / (2 * jnp.where(a > 0, a, 1.0)), 0.0)
-    curvature, slope = jnp.sum(d * a), -jnp.sum(d * at.qn)
+    stored = jnp.where(
+        closing & ~stays, d * at.qn**2 / (2 * jnp.where(a > 0, a, 1.0)), 0.0
+    )
+    curvature = jnp.sum(d * a)
+    slope = -jnp.sum(d * at.qn)
     square = slope**2 - 2 * curvature * jnp.sum((1 - inputs.restitution**2) * stored)
     allowed = (square >= -noise * slope**2) & ~jnp.any(stays) & (curvature > 0)
     real = allowed & (square > 0)
@@ -375,7 +429,8 @@ def _correlated(
 def _with_friction(
     inputs: Inputs, friction: CoulombFriction, at: CollisionState, contact: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Normalized impulses (m,), (t,) of a collision at one `contact` () with friction, and status.
+    """Normalized impulses (m,), (t,) of a collision at one `contact` () with friction,
+    and status.
 
     Equation: `qn+ = -e qn-` where this needs an impulse `p >= 0`, and
     `p_t in -mu p Sgn(u+ + e_t u-)`; impulses of other contacts are 0.
@@ -401,20 +456,25 @@ def _with_friction(
 
 
 def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """True () if two contacts collide without end, `first` to begin, and the limit impulses (2,).
+    """True () if two contacts collide without end, `first` to begin, and the limit
+    impulses (2,).
 
     Approach speeds of successive collisions at j, k, j, ... obey, c = -G_12,
 
         s_3 = c (1 + e_k) s_2 - e_j s_1,
 
-    two steps of which have trace `c^2 (1 + e_1) (1 + e_2) - e_1 - e_2` and determinant e_1 e_2.
-    They stay positive iff both eigenvalues are (z >= 1, c > 0) and s_3 / s_1 is not below the
-    smaller one, `chi(lambda) = lambda^2 - trace lambda + det = 0`. The limit is gamma = 0.
+    two steps of which have trace `c^2 (1 + e_1) (1 + e_2) - e_1 - e_2` and determinant
+    e_1 e_2. They stay positive iff both eigenvalues are (z >= 1, c > 0) and s_3 / s_1
+    is not below the smaller one, `chi(lambda) = lambda^2 - trace lambda + det = 0`. The
+    limit is gamma = 0.
     """
-    e, qn = jnp.broadcast_to(inputs.restitution, (2,)), inputs.qn
+    e = jnp.broadcast_to(inputs.restitution, (2,))
+    qn = inputs.qn
     c = -inputs.coupling[0]
     noise = precision(qn.dtype).noise
-    e_j, e_k, s_1 = e[first], e[1 - first], -qn[first]
+    e_j = e[first]
+    e_k = e[1 - first]
+    s_1 = -qn[first]
     s_2 = c * (1 + e_j) * s_1 - qn[1 - first]
     det = e_j * e_k
     trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
@@ -423,12 +483,14 @@ def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array
     above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + det))
     possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(det)))
     endless = possible & (s_2 > 0) & (ratio >= 0) & above
-    # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric series
+    # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric
+    # series
     det_g = 1 - c**2
     redundant = det_g <= noise
     inverse = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, det_g)  # -G^-1 qn
     decay = jnp.where(det < 1, 1 - det, 1.0)
-    series_j, series_k = (1 + e_j) * s_1 / decay, (1 + e_k) * s_2 / decay
+    series_j = (1 + e_j) * s_1 / decay
+    series_k = (1 + e_k) * s_2 / decay
     chosen = jnp.arange(2, dtype=jnp.int32) == first
     p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), inverse)
     return endless & ~(redundant & (det >= 1)), p

@@ -1,4 +1,6 @@
-"""Compliant contacts: real gaps and a force that depends on indentation and its rate."""
+"""Compliant contacts: real gaps and a force that depends on indentation and its
+rate.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,8 +20,19 @@ from jimpact.events.impact_dynamics import (
     solve,
     tangential_of,
 )
-from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_few_contacts, check_spring, solver_of, tangential_spring
+from jimpact.laws.forces import (
+    Bistiffness,
+    Force,
+    HuntCrossley,
+    KelvinVoigt,
+    KuwabaraKono,
+)
+from jimpact.laws.lzb import (
+    check_few_contacts,
+    check_spring,
+    solver_of,
+    tangential_spring,
+)
 from jimpact.numerics.derive import ADJOINTS
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_choice, check_values
@@ -30,42 +43,50 @@ from jimpact.tools.precision import check_rtol
 class Compliant(Law):
     """Unilateral compliant contacts, each with its own gap: opens, waits, closes again.
 
-    Equation: `M v' = N F`, `x_j' = -gamma_j`, `F_j = max(f(x_j, x_j'), 0)` while `x_j > 0`, from
-    `x_j = -gap_j` until no contact is loaded or approaches. Free flight between contacts is exact,
-    so that gaps of any size cost nothing. Geometry (M and N) is frozen.
+    Equation: `M v' = N F`, `x_j' = -gamma_j`, `F_j = max(f(x_j, x_j'), 0)` while
+    `x_j > 0`, from `x_j = -gap_j` until no contact is loaded or approaches. Free flight
+    between contacts is exact, so that gaps of any size cost nothing. Geometry (M and N)
+    is frozen.
 
     Args:
         force: a contact force: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
             `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
-            `KuwabaraKono(k, A)`, `ElastoPlastic(k, F_y, eta)`, `UserForce(function, parameters)`;
-            stiffness k [N / m^eta], exponent eta, restitution e, damping c [N s/m], d [s/m],
-            dissipative time A [s], yield force F_y [N].
-        friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
+            `KuwabaraKono(k, A)`, `ElastoPlastic(k, F_y, eta)`,
+            `UserForce(function, parameters)`; stiffness k [N / m^eta], exponent eta,
+            restitution e, damping c [N s/m], d [s/m], dissipative time A [s], yield
+            force F_y [N].
+        friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None:
+            none.
         tangential_stiffness: kappa > 0, scalar or (m,), of a tangential spring
-            `k_t = kappa dF/dx(x)` with a force of x alone, as in `LZB`; None: contacts stick
-            rigidly.
-        initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
-            a viscous force.
-        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with method
-            'implicit' 1e-5 (float32: 1e-4).
+            `k_t = kappa dF/dx(x)` with a force of x alone, as in `LZB`; None: contacts
+            stick rigidly.
+        initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed
+            contacts; not with a viscous force.
+        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with
+            method 'implicit' 1e-5 (float32: 1e-4).
         max_steps: maximum attempted steps.
         method: 'time', 'implicit' or 'auto' (default), as in `LZB`.
-        check_conditioning: solve a second time to detect `ill_conditioned`, as in `LZB`.
+        check_conditioning: solve a second time to detect `ill_conditioned`, as in
+            `LZB`.
         adjoint: 'jacobian' (default), 'forward' or 'checkpoints', as in `LZB`.
 
-    Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`
+    Status: `max_steps`; `plastic_limit` where contacts re-close without end;
+    `ill_conditioned`
     if checked.
 
-    Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-; one-sided
-    where a gap is 0 and at grazing events. Where two orders of collision meet, the outcome changes
-    within gaps of about `gap_scale`; there derivatives are of order |change of v+| / `gap_scale`.
-    Method 'implicit' has first derivatives only, as in `LZB`.
+    Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-;
+    one-sided where a gap is 0 and at grazing events. Where two orders of collision
+    meet, the outcome changes within gaps of about `gap_scale`; there derivatives are of
+    order |change of v+| / `gap_scale`. Method 'implicit' has first derivatives only, as
+    in `LZB`.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.16).
 
     >>> import jimpact as ji
     >>> law = ji.Compliant(ji.Hertz(1.0))
-    >>> out = ji.impact(law, ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0])
+    >>> out = ji.impact(
+    ...     law, ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0]
+    ... )
     >>> [round(float(v), 5) for v in out.velocity]
     [-0.04134, 0.04313, 0.99821]
     """
@@ -83,10 +104,12 @@ class Compliant(Law):
     adjoint: str = option("jacobian", ADJOINTS)
 
     def __check_init__(self) -> None:
-        """Raise a TypeError unless `force` is a `Force`, a ValueError for what it does not allow.
+        """Raise a TypeError unless `force` is a `Force`, a ValueError for what it does
+        not allow.
 
-        A viscous force, F(x, x'), and one that yields (`bound`) allow no `initial_energy`: their
-        energy is no function of x alone. One that yields allows no friction, no method 'implicit'.
+        A viscous force, F(x, x'), and one that yields (`bound`) allow no
+        `initial_energy`: their energy is no function of x alone. One that yields allows
+        no friction, no method 'implicit'.
         """
         if not isinstance(self.force, Force):
             raise TypeError(
@@ -95,18 +118,22 @@ class Compliant(Law):
             )
         check_spring(self)
         yields = self.force.bound is not None
-        viscous = self.force.bistiffness is None  # no pair of F(x), to load and to unload
+        # no pair of F(x), to load and to unload
+        viscous = self.force.bistiffness is None
         if self.tangential_stiffness is not None and viscous:
             raise ValueError(
-                "Argument `tangential_stiffness` must be None with a force that depends on the "
+                "Argument `tangential_stiffness` must be None with a force that "
+                "depends on the "
                 "rate of indentation, as k_t = kappa dF/dx(x), but the force is "
-                f"{self.force!r}: PowerLaw, LinearSpring, Hertz and Bistiffness have it."
+                f"{self.force!r}: PowerLaw, LinearSpring, Hertz and Bistiffness have "
+                f"it."
             )
         if viscous or yields:
             check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
         if yields and (self.friction is not None or self.method == "implicit"):
             raise ValueError(
-                "Argument `force` must not yield with friction or method 'implicit', but has value "
+                "Argument `force` must not yield with friction or method 'implicit', "
+                "but has value "
                 f"{self.force!r}."
             )
 
@@ -121,7 +148,9 @@ class Compliant(Law):
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError for an `rtol` below rounding, or too many contacts with friction."""
+        """Raise a ValueError for an `rtol` below rounding, or too many contacts with
+        friction.
+        """
         if self.rtol is not None:
             check_rtol(self.rtol, dtype)
         if self.friction is not None:
@@ -134,18 +163,27 @@ class Compliant(Law):
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dimensionless dynamics of the whole encounter, gaps included.
 
-        Units are those of a power law k x^eta: of the `Bistiffness`, or, for other forces, of the
-        linear spring k = q^2 / x^2 that stores the energy q^2 / 2 of the fastest approach q
-        [sqrt(J)] at the indentation x at which the force does, too (`indentation_scale`).
+        Units are those of a power law k x^eta: of the `Bistiffness`, or, for other
+        forces, of the linear spring k = q^2 / x^2 that stores the energy q^2 / 2 of the
+        fastest approach q [sqrt(J)] at the indentation x at which the force does, too
+        (`indentation_scale`).
         """
-        gamma, force, viscous = contact.gap_velocity, self.force, None
+        gamma = contact.gap_velocity
+        force = self.force
+        viscous = None
         bistiffness = force.bistiffness
         if bistiffness is not None:
-            k, e, exponent = bistiffness.stiffness, bistiffness.restitution, bistiffness.exponent
+            k = bistiffness.stiffness
+            e = bistiffness.restitution
+            exponent = bistiffness.exponent
         else:
-            q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus)))
+            q = jnp.max(
+                jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus))
+            )
             k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
-            k, e, exponent = jax.lax.stop_gradient(k), jnp.ones_like(gamma), 1.0
+            k = jax.lax.stop_gradient(k)
+            e = jnp.ones_like(gamma)
+            exponent = 1.0
         method, rtol = solver_of(self, contact)
         problem, units = dimensionless(
             contact.delassus,
@@ -158,23 +196,33 @@ class Compliant(Law):
             contact.gaps,
         )
         if bistiffness is None:
-            speed, depth = units.velocity * units.root, units.indentation
+            speed = units.velocity * units.root
+            depth = units.indentation
             onset = jax.lax.stop_gradient(force.onset_scale(depth, speed))
             viscous = Viscous(force, depth, speed, units.momentum / units.time, onset)
         problem = problem._replace(viscous=viscous)
-        if bistiffness is not None and force.bound is not None:  # yields where k x^eta = F_y
+        # yields where k x^eta = F_y
+        if bistiffness is not None and force.bound is not None:
             depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))
             problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
-            tangential = tangential_of(contact, self.friction, self.tangential_stiffness, units)
+            tangential = tangential_of(
+                contact, self.friction, self.tangential_stiffness, units
+            )
             problem = problem._replace(tangential=tangential)
-        structure, most = contact.structure, self.max_steps
+        structure = contact.structure
+        most = self.max_steps
         return Dynamics(problem, units, exponent, structure, most, method, self.adjoint)
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses p (m,), p_t (t,) [N s] over the whole encounter, gaps included, and status."""
-        checked = contact if self.check_conditioning else None
+        """Impulses p (m,), p_t (t,) [N s] over the whole encounter, gaps included, and
+        status.
+        """
+        if self.check_conditioning:
+            checked = contact
+        else:
+            checked = None
         return Impulses(*solve(self.dynamics(contact), checked))
 
 
@@ -197,9 +245,11 @@ def make_compliant(
         exponent: eta >= 1 of a bistiffness and of Hunt and Crossley's force.
         restitution: e in [0, 1] of a bistiffness.
         rheology: one of `RHEOLOGIES`.
-        damping: of a viscous rheology, in the unit of its force; None for a bistiffness.
+        damping: of a viscous rheology, in the unit of its force; None for a
+            bistiffness.
         friction: Coulomb's mu; None: none.
-        tangential_stiffness: kappa of a tangential spring; None: contacts stick rigidly.
+        tangential_stiffness: kappa of a tangential spring; None: contacts stick
+            rigidly.
     """
     viscous: dict[str, Callable[..., Force]] = {
         "kelvin-voigt": KelvinVoigt,
@@ -209,11 +259,14 @@ def make_compliant(
     check_choice("rheology", rheology, RHEOLOGIES)
     if (rheology == "bistiffness") != (damping is None):
         raise ValueError(
-            "Argument `damping` must be given for a viscous rheology and only there, but "
+            "Argument `damping` must be given for a viscous rheology and only there, "
+            "but "
             f"`rheology` is {rheology!r} and `damping` has value {damping!r}."
         )
     if rheology == "bistiffness":
         force: Force = Bistiffness(stiffness, exponent, restitution)
     else:
         force = viscous[rheology](stiffness, damping)
-    return Compliant(force, friction=friction, tangential_stiffness=tangential_stiffness)
+    return Compliant(
+        force, friction=friction, tangential_stiffness=tangential_stiffness
+    )

@@ -1,8 +1,8 @@
 """Force-indentation laws of a compliant contact, for `Compliant`.
 
-Each gives the force [N] at indentation x >= 0 [m] and indentation rate x' [m/s], contact by
-contact: parameters are scalars or (m,). Forces never pull: where a damper would, the contact is
-slack until the force returns.
+Each gives the force [N] at indentation x >= 0 [m] and indentation rate x' [m/s],
+contact by contact: parameters are scalars or (m,). Forces never pull: where a damper
+would, the contact is slack until the force returns.
 """
 
 from collections.abc import Callable
@@ -23,22 +23,25 @@ from jimpact.core.law import (
 from jimpact.tools.checks import as_float_array, check_function
 from jimpact.tools.loops import fori_loop
 
-_SEARCH = (-60.0, 60.0)  # decades [m] in which the indentation scale of a force is searched
+# decades [m] in which the indentation scale of a force is searched
+_SEARCH = (-60.0, 60.0)
 _BISECTIONS = 50  # halvings of these decades, to about 1e-13 of one
-# |zeta - 1| below which e of damped and overdamped springs is one series, and its terms: each is
-# half of |zeta - 1| times the one before, so that the third derivative has an error of 1e-17. Ten
-# times less, and the third derivative of the formulas outside would lose nine digits to their 0 /
-# 0.
-_CRITICAL, _CRITICAL_TERMS = 0.1, 18
+# |zeta - 1| below which e of damped and overdamped springs is one series, and its
+# terms: each is half of |zeta - 1| times the one before, so that the third derivative
+# has an error of 1e-17. Ten times less, and the third derivative of the formulas
+# outside would lose nine digits to their 0 / 0.
+_CRITICAL = 0.1
+_CRITICAL_TERMS = 18
 
 
 class Force(Declared):
-    """A contact force; `force` and, where it may slacken, `onset` (of the same sign, smooth).
+    """A contact force; `force` and, where it may slacken, a smooth `onset` of its sign.
 
-    A force of your own with declared parameters inherits it; `UserForce` takes a function. What
-    else it can do it declares: `slackens`, the force may end before the indentation does;
-    `bistiffness`, for forces that are one, and the `bound` of one that yields; `damping_scale` and
-    a parameter `damping`, for `calibrate`; `pair_restitution`, where it is known in closed form.
+    A force of your own with declared parameters inherits it; `UserForce` takes a
+    function. What else it can do it declares: `slackens`, the force may end before the
+    indentation does; `bistiffness`, for forces that are one, and the `bound` of one
+    that yields; `damping_scale` and a parameter `damping`, for `calibrate`;
+    `pair_restitution`, where it is known in closed form.
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
@@ -58,16 +61,24 @@ class Force(Declared):
         raise NotImplementedError(f"{type(self).__name__} must define `force`.")
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Sign of the force at x >= 0 and rate x', of any dimension; positive at rate 0."""
+        """Sign of the force at x >= 0 and rate x', of any dimension; positive at rate
+        0.
+        """
         return self.force(x, rate)
 
     def onset_scale(self, depth: jax.Array, speed: jax.Array) -> jax.Array:
-        """Largest `onset` at indentation `depth` (m,) [m], at rest and at `speed` (m,) [m/s]."""
-        return jnp.maximum(self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed))
+        """Largest `onset` at indentation `depth` (m,) [m], at rest and at `speed` (m,)
+        [m/s].
+        """
+        return jnp.maximum(
+            self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed)
+        )
 
     @property
     def bistiffness(self) -> "Bistiffness | None":
-        """The same force as a `Bistiffness`, which stores energy and has a history; else None."""
+        """The same force as a `Bistiffness`, which stores energy and has a history;
+        else None.
+        """
         return None
 
     @property
@@ -76,7 +87,9 @@ class Force(Declared):
         return None
 
     def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
-        """A strong `damping` of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: no such."""
+        """A strong `damping` of a pair of reduced `mass` [kg] at a `speed` [m/s]; None:
+        no such.
+        """
         return None
 
     def with_damping(self, damping: jax.Array) -> "Force":
@@ -85,11 +98,14 @@ class Force(Declared):
         return force
 
     def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
-        """e of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: to be integrated."""
+        """e of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: to be
+        integrated.
+        """
         return None
 
     def indentation_scale(self, energy: jax.Array) -> jax.Array:
-        """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) = 2 energy.
+        """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) =
+        2 energy.
 
         By bisection of log10(x); no derivatives.
         """
@@ -101,8 +117,12 @@ class Force(Declared):
 
         low, high = (jnp.full_like(energy, end) for end in _SEARCH)
 
-        def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            """The half of the intervals (low, high) in which the excess changes sign."""
+        def halve(
+            _: int, ends: tuple[jax.Array, jax.Array]
+        ) -> tuple[jax.Array, jax.Array]:
+            """The half of the intervals (low, high) in which the excess changes
+            sign.
+            """
             middle = 0.5 * (ends[0] + ends[1])
             above = excess(middle) > 0
             return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])
@@ -112,11 +132,12 @@ class Force(Declared):
 
 
 class Bistiffness(Force):
-    """Elastic-plastic contact of `LZB`: loading `k x^eta`, unloading steeper, to a residual x.
+    """Elastic-plastic contact of `LZB`: loads as `k x^eta`, unloads steeper, to x > 0.
 
     Equation: loading `F = k x^eta`; unloading from (x_c, F_c) along
-    `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation `x_r = (1 - e^2) x_c`,
-    where the surface remains after unloading. The pair's restitution coefficient is e at any speed.
+    `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation
+    `x_r = (1 - e^2) x_c`, where the surface remains after unloading. The pair's
+    restitution coefficient is e at any speed.
 
     Args:
         stiffness: k > 0 [N / m^eta].
@@ -157,27 +178,36 @@ class Bistiffness(Force):
 class ElastoPlastic(Force):
     """Elastic contact that yields: `F = k x^eta` up to a force that it never exceeds.
 
-    Equation: `F = k x_e^eta` of the elastic indentation, `x_e' = -gamma`, but `x_e' = 0` while
-    `F = F_y` and the contact is compressed. Unloading is elastic, along another branch, to the
-    residual indentation x - x_e, where the surface remains. A pair is elastic up to a speed v_y;
-    above it `e = v_y / v`, as it returns at most the elastic energy at F_y,
+    Equation: `F = k x_e^eta` of the elastic indentation, `x_e' = -gamma`, but
+    `x_e' = 0` while
+    `F = F_y` and the contact is compressed. Unloading is elastic, along another branch,
+    to the residual indentation x - x_e, where the surface remains. A pair is elastic up
+    to a speed v_y; above it `e = v_y / v`, as it returns at most the elastic energy at
+    F_y,
     `m v_y^2 / 2 = F_y^((eta + 1) / eta) / ((eta + 1) k^(1 / eta))`.
 
-    A `Bistiffness`, in comparison, loses its share at any speed, and its force has no bound.
+    A `Bistiffness`, in comparison, loses its share at any speed, and its force has no
+    bound.
 
     Args:
         stiffness: k > 0 [N / m^eta].
         yield_force: F_y > 0 [N].
         exponent: eta >= 1; a float (or a tuple) is static, an array is differentiable.
 
-    `Compliant` takes it without friction, and not by method 'implicit'; motions do not take it.
+    `Compliant` takes it without friction, and not by method 'implicit'; motions do not
+    take it.
 
-    Source: elastic, ideally plastic contact; Brogliato, Nonsmooth Mechanics (2016), 6.3.1, on what
-    a bistiffness leaves out.
+    Source: elastic, ideally plastic contact; Brogliato, Nonsmooth Mechanics (2016),
+    6.3.1, on what a bistiffness leaves out.
 
     >>> import jimpact as ji
-    >>> force = ji.ElastoPlastic(8.0, yield_force=2.0, exponent=1.0)  # F_y^2 / (2 k) = 1/4 J
-    >>> [round(float(ji.measured_restitution(force, mass=2.0, speed=v)), 6) for v in (0.4, 1.0)]
+    >>> force = ji.ElastoPlastic(
+    ...     8.0, yield_force=2.0, exponent=1.0
+    ... )  # F_y^2 / (2 k) = 1/4 J
+    >>> [
+    ...     round(float(ji.measured_restitution(force, mass=2.0, speed=v)), 6)
+    ...     for v in (0.4, 1.0)
+    ... ]
     [1.0, 0.5]
     """
 
@@ -198,9 +228,15 @@ class ElastoPlastic(Force):
         return self.yield_force
 
     def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
-        """`e = min(1, v_y / v)` with `m v_y^2 / 2` the elastic energy at the yield force."""
+        """`e = min(1, v_y / v)` with `m v_y^2 / 2` the elastic energy at the yield
+        force.
+        """
         eta = jnp.asarray(self.exponent, mass.dtype)
-        energy = self.yield_force ** ((eta + 1) / eta) / (eta + 1) / self.stiffness ** (1 / eta)
+        energy = (
+            self.yield_force ** ((eta + 1) / eta)
+            / (eta + 1)
+            / self.stiffness ** (1 / eta)
+        )
         return jnp.minimum(1.0, jnp.sqrt(2 * energy / mass) / speed)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
@@ -268,7 +304,7 @@ def LinearSpring(stiffness: Any) -> Bistiffness:
 
 
 class KelvinVoigt(Force):
-    """Spring and damper in parallel: `F = k x + c x'`, cut at 0 (the damper would pull).
+    """Spring and damper in parallel: `F = k x + c x'`, cut at 0.
 
     Args:
         stiffness: k > 0 [N/m].
@@ -372,7 +408,9 @@ class KuwabaraKono(Force):
         return self.stiffness * root * (x + 1.5 * self.damping * rate)
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """`k (x + 1.5 A x') sqrt(x_1)`: without the root, whose slope at 0 is infinite."""
+        """`k (x + 1.5 A x') sqrt(x_1)`: without the root, whose slope at 0 is
+        infinite.
+        """
         return self.stiffness * (x + 1.5 * self.damping * rate)
 
 
@@ -380,11 +418,12 @@ class UserForce(Force):
     """A force of your own: `function(x, rate, parameters)`, for arrays (m,); cut at 0.
 
     Args:
-        function: smooth for x >= 0; it must push at x > 0, rate = 0. Where F(0) > 0 the contact
-            ends at x = 0 with that force. Contacts that touch at rest can then take any force up
-            to F(0) without motion; this is not resolved (status `max_steps`).
-        parameters: any pytree; its arrays are differentiable. `calibrate` finds the entry
-            'damping' of a dict.
+        function: smooth for x >= 0; it must push at x > 0, rate = 0. Where F(0) > 0 the
+            contact ends at x = 0 with that force. Contacts that touch at rest can then
+            take any force up to F(0) without motion; this is not resolved (status
+            `max_steps`).
+        parameters: any pytree; its arrays are differentiable. `calibrate` finds the
+            entry 'damping' of a dict.
 
     >>> import jimpact as ji
     >>> soft = ji.UserForce(lambda x, rate, k: k * x * (1 + x), 3.0)
@@ -401,10 +440,14 @@ class UserForce(Force):
     def __init__(self, function: Callable[..., jax.Array], parameters: Any = None):
         check_function("function", function)
         self.function = function
-        self.parameters = jax.tree.map(lambda leaf: as_float_array("parameters", leaf), parameters)
+        self.parameters = jax.tree.map(
+            lambda leaf: as_float_array("parameters", leaf), parameters
+        )
 
     def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
-        """The size of the entry 'damping' of `parameters`, if they are a dict with one."""
+        """The size of the entry 'damping' of `parameters`, if they are a dict with
+        one.
+        """
         if not isinstance(self.parameters, dict) or "damping" not in self.parameters:
             return None
         return jnp.abs(self.parameters["damping"])
@@ -436,7 +479,8 @@ def _damped_spring(zeta: jax.Array) -> jax.Array:
     z = jnp.where(under, 2.0, away)
     root = jnp.sqrt(z**2 - 1)
     overdamped = jnp.log(z + root) / root  # Q
-    series, y = jnp.ones_like(zeta), jnp.where(near, 1 - zeta, 0.0)
+    series = jnp.ones_like(zeta)
+    y = jnp.where(near, 1 - zeta, 0.0)
     for n in range(_CRITICAL_TERMS, 0, -1):
         series = 1 + n / (2 * n + 1) * y * series
     quotient = jnp.where(near, series, jnp.where(under, underdamped, overdamped))

@@ -1,4 +1,6 @@
-"""Coulomb friction of the algebraic laws: their two fields, and the solver behind one function."""
+"""Coulomb friction of the algebraic laws: their two fields, and the solver behind one
+function.
+"""
 
 from typing import Any
 
@@ -19,9 +21,12 @@ def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, An
     """
     if friction is not None:
         return friction, tangential_restitution
-    if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):
+    if is_traced(tangential_restitution) or np.any(
+        np.asarray(tangential_restitution) != 0
+    ):
         raise ValueError(
-            "Argument `tangential_restitution` must be 0 without `friction`: then nothing acts "
+            "Argument `tangential_restitution` must be 0 without `friction`: then "
+            "nothing acts "
             f"along the contacts, but has value {tangential_restitution!r}."
         )
     return None, None
@@ -35,16 +40,24 @@ def frictional_impulses(
     *,
     complementary: bool,
 ) -> Impulses:
-    """Impulses p (m,), p_t (t,) [N s] of a law that prescribes gap velocities, with friction.
+    """Impulses p (m,), p_t (t,) [N s] of a law that prescribes gap velocities, with
+    friction.
 
-    Equation: `W p + W_nt p_t + b = 0`, or (`complementary`) `0 <= W p + W_nt p_t + b  _|_  p >= 0`,
-    b = `normal` (m,) [m/s], and `p_t in -mu p Sgn(u+ + e_t u-)`, mu = `friction`,
+    Equation: `W p + W_nt p_t + b = 0`, or (`complementary`)
+    `0 <= W p + W_nt p_t + b  _|_  p >= 0`, b = `normal` (m,) [m/s], and
+    `p_t in -mu p Sgn(u+ + e_t u-)`, mu = `friction`,
     e_t = `tangential_restitution`, () or (m,).
     """
     assert contact.slip is not None  # see `check_law`
     ones = jnp.ones_like(contact.gap_velocity)
-    slip = (1 + jnp.repeat(tangential_restitution * ones, contact.tangents)) * contact.slip
+    slip = (
+        1 + jnp.repeat(tangential_restitution * ones, contact.tangents)
+    ) * contact.slip
     solution = solve(
-        contact.whole_delassus, normal, slip, friction * ones, complementary=complementary
+        contact.whole_delassus,
+        normal,
+        slip,
+        friction * ones,
+        complementary=complementary,
     )
     return Impulses(solution.normal, solution.tangential, solution.status)

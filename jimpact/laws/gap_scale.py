@@ -14,14 +14,15 @@ from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import is_traced
 from jimpact.tools.records import readable_unit
 
-# Gaps over delta_c that are described as touching (below) and as wide (above): the crossover
-# between the two is about 2 delta_c wide.
-NEARLY_TOUCHING, WIDE = 0.1, 2.0
+# Gaps over delta_c that are described as touching (below) and as wide (above): the
+# crossover between the two is about 2 delta_c wide.
+NEARLY_TOUCHING = 0.1
+WIDE = 2.0
 DELTA_C = "delta_c: indentation of a contact at the largest approach speed of the scene"
 
 
 class GapScale(eqx.Module):
-    """`delta` (m,) [m], indentation scale of each contact, and the scene's `gaps` (m,) [m]."""
+    """Indentation scale `delta` (m,) [m] of contacts, and their `gaps` (m,) [m]."""
 
     delta: jax.Array
     gaps: jax.Array
@@ -66,9 +67,10 @@ def _length(metres: float) -> str:
 def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     """Indentation scale `delta_c` of every contact, by which a gap is small or large.
 
-    Equation: `delta_c = (m v^2 / k)^(1 / (eta + 1))` with the largest approach speed v of the
-    scene and `m_j = 2 / W_jj`, the mass of two equal balls (in general `2 m1 m2 / (m1 + m2)`); for
-    forces other than power laws `F(delta_c) delta_c = m v^2`.
+    Equation: `delta_c = (m v^2 / k)^(1 / (eta + 1))` with the largest approach speed v
+    of the scene and `m_j = 2 / W_jj`, the mass of two equal balls (in general
+    `2 m1 m2 / (m1 + m2)`); for forces other than power laws
+    `F(delta_c) delta_c = m v^2`.
 
     Args:
         scene: its gaps, None: all closed.
@@ -82,17 +84,22 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
         TypeError: a law without indentation.
 
     >>> import jimpact as ji
-    >>> scene = ji.chain([0.0665, 0.0665, 0.0665], gaps=[0.0, 1e-4])  # one-inch steel balls
-    >>> print(ji.theory.gap_scale(scene, ji.Compliant(ji.Hertz(1.2e10)), [1.0, 0.0, 0.0]))
+    >>> scene = ji.chain(
+    ...     [0.0665, 0.0665, 0.0665], gaps=[0.0, 1e-4]
+    ... )  # one-inch steel balls
+    >>> print(
+    ...     ji.theory.gap_scale(scene, ji.Compliant(ji.Hertz(1.2e10)), [1.0, 0.0, 0.0])
+    ... )
     gap 1 is closed (delta_c = 31.4 µm)
-    gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come one after another
+    gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come ...
     delta_c: indentation of a contact at the largest approach speed of the scene
     """
     v = as_velocity(scene, velocity, finite=True)
     force = law.contact_force
     if force is None:
         raise TypeError(
-            "Argument `law` must have a `contact_force`, by which its contacts indent (Compliant, "
+            "Argument `law` must have a `contact_force`, by which its contacts indent "
+            "(Compliant, "
             f"LZB), but is {law!r}."
         )
     check_law(law, scene, v.dtype)
@@ -103,5 +110,8 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
         delta = (work / force.bistiffness.stiffness) ** (1 / (eta + 1))
     else:
         delta = force.indentation_scale(0.5 * work)
-    gaps = jnp.zeros_like(work) if scene.gaps is None else scene.gaps
+    if scene.gaps is None:
+        gaps = jnp.zeros_like(work)
+    else:
+        gaps = scene.gaps
     return GapScale(jnp.where(speed > 0, delta, 0.0), gaps)

@@ -1,4 +1,6 @@
-"""Histories of an impact: forces, indentations, energies and velocities over its time."""
+"""Histories of an impact: forces, indentations, energies and velocities over its
+time.
+"""
 
 import dataclasses
 from typing import Any
@@ -20,13 +22,15 @@ from jimpact.tools.compiling import full_precision, quick_jit
 class History(eqx.Module):
     """Histories over impact time: rows are samples; SI units.
 
-    `time` (s,), `force`, `indentation`, `energy`, `impulse`, `gap_velocity`, `approach` (s, m),
-    `velocity` (s, n); with friction `tangential_force`, `tangential_impulse` and `slip` (s, t),
-    else t = 0; `tangential_energy` (s, m), `k_t xi^2 / 2` of tangential springs, else (s, 0);
-    `duration` (), `maximum_force` (m,) and `status` of the whole impact.
-    `indentation` is the effective one, `E = k x^(eta + 1) / (eta + 1)`, of the loading curve: it
-    ends at 0. `approach` is the true one, `-int gamma dt`: where the force ends it is the residual
-    indentation, and force against it encloses the energy lost (`ji.plot.contact_loop`).
+    `time` (s,), `force`, `indentation`, `energy`, `impulse`, `gap_velocity`, `approach`
+    (s, m), `velocity` (s, n); with friction `tangential_force`, `tangential_impulse`
+    and `slip` (s, t), else t = 0; `tangential_energy` (s, m), `k_t xi^2 / 2` of
+    tangential springs, else (s, 0); `duration` (), `maximum_force` (m,) and `status` of
+    the whole impact.
+    `indentation` is the effective one, `E = k x^(eta + 1) / (eta + 1)`, of the loading
+    curve: it ends at 0. `approach` is the true one, `-int gamma dt`: where the force
+    ends it is the residual indentation, and force against it encloses the energy lost
+    (`ji.plot.contact_loop`).
     """
 
     time: jax.Array
@@ -51,14 +55,14 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     """Sample the impact of a law that has a history at equal intervals of impact time.
 
     Equation: `gamma' = W F`, `p' = F`, `F_j = k_j x_j^eta_j`; between the steps of the
-    integrator a sample is one more step of the same method. (With friction in space the intervals
-    are only nearly equal: see `time`.)
+    integrator a sample is one more step of the same method. (With friction in space the
+    intervals are only nearly equal: see `time`.)
 
     Args:
         law: an `LZB`, a `Compliant` with a power law or a `Bistiffness`
-            (gaps included: `indentation` is 0 while a contact is open), a `VelocityDependent` of
-            these, or a law of your own with `has_history` and `dynamics`; a stiffness in SI units
-            makes time and force SI.
+            (gaps included: `indentation` is 0 while a contact is open), a
+            `VelocityDependent` of these, or a law of your own with `has_history` and
+            `dynamics`; a stiffness in SI units makes time and force SI.
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
         samples: number of rows, first before and last after the impact.
@@ -72,8 +76,13 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
         TypeError: a law without impact dynamics. ValueError: what `impact` refuses.
 
     >>> import jimpact as ji
-    >>> h = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
-    >>> round(float(h.duration), 3), round(float(h.maximum_force[0]), 3)  # pi/sqrt(k), sqrt(k)
+    >>> h = ji.history(
+    ...     ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]
+    ... )
+    >>> (
+    ...     round(float(h.duration), 3),
+    ...     round(float(h.maximum_force[0]), 3),
+    ... )  # pi/sqrt(k), sqrt(k)
     (2.221, 1.414)
     """
     check_kind("law", law, Law)
@@ -95,24 +104,36 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
 
 
 @quick_jit
-def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced) -> History:
-    """`History` of s = `samples` rows in SI units, from the dimensionless dynamics of the law.
+def _history(
+    law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced
+) -> History:
+    """`History` of s = `samples` rows in SI units, from the dimensionless dynamics of
+    the law.
 
-    Where nothing happens, the dynamics run from gamma- = -1 m/s, and their samples are replaced by
-    values before the impact.
+    Where nothing happens, the dynamics run from gamma- = -1 m/s, and their samples are
+    replaced by values before the impact.
     """
     contact = law.contact(scene, v)
-    happens, gamma = contact.happens, contact.gap_velocity
+    happens = contact.happens
+    gamma = contact.gap_velocity
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
-    t, units = dynamics.tangents, dynamics.units
-    program, leaves = dynamics.program(with_end_time=True), dynamics.columns()[0]
-    differentiated = dataclasses.replace(program, checkpoints=dynamics.adjoint == "checkpoints")
-    programs = history_program(program, samples), history_program(differentiated, samples)
+    t = dynamics.tangents
+    units = dynamics.units
+    program = dynamics.program(with_end_time=True)
+    leaves = dynamics.columns()[0]
+    differentiated = dataclasses.replace(
+        program, checkpoints=dynamics.adjoint == "checkpoints"
+    )
+    programs = (
+        history_program(program, samples),
+        history_program(differentiated, samples),
+    )
     time, energy, *rest = in_lanes(*programs, *leaves, adjoint=dynamics.adjoint)
     *rows, maximum, code = (x[..., 0] for x in rest)
     states = ContactStates(*rows)
-    unit_force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))
+    unit_force = units.momentum / units.time
+    root = jnp.repeat(units.root, t // len(gamma))
 
     def sampled(x: jax.Array, before: Any = 0.0) -> jax.Array:
         """Samples x; where nothing happens the value `before` the impact."""
@@ -121,11 +142,18 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced)
     impulse = sampled(states.impulse * units.momentum[None])
     tangential = sampled(states.tangential_impulse * (units.velocity / root)[None])
     change = jax.vmap(lambda p, p_t: velocity_change(scene, p, p_t if t else None))
-    slip = jnp.zeros(0, v.dtype) if contact.slip is None or not t else contact.slip
+    if contact.slip is None or not t:
+        slip = jnp.zeros(0, v.dtype)
+    else:
+        slip = contact.slip
     seconds = sampled(time[:, 0, 0] * units.time)
     force = sampled(states.force * unit_force[None])
-    friction = sampled(states.tangential_force * (units.velocity / root / units.time)[None])
-    rates = sampled(states.gap_velocity * (units.velocity * units.root)[None], gamma[None])
+    friction = sampled(
+        states.tangential_force * (units.velocity / root / units.time)[None]
+    )
+    rates = sampled(
+        states.gap_velocity * (units.velocity * units.root)[None], gamma[None]
+    )
     # gap accelerations N^T M^-1 (N F + H F_t)
     growth = jax.vmap(lambda dv: gap_velocity(scene, dv))(change(force, friction))
     size = jnp.where(happens, contact.size, 1.0)
@@ -145,16 +173,21 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced)
         tangential_energy=sampled(0.5 * units.velocity**2 * states.tangential_energy),
         duration=sampled(time[-1, 0, 0] * units.time),
         maximum_force=sampled(maximum * unit_force),
-        status=traced.status((law, scene, v, NOTHING_GIVEN), sampled(code[0]), size, finite),
+        status=traced.status(
+            (law, scene, v, NOTHING_GIVEN), sampled(code[0]), size, finite
+        ),
     )
 
 
 def _integral(time: jax.Array, values: jax.Array, rates: jax.Array) -> jax.Array:
     """Integrals (s, m) of `values` y (s, m) over `time` t (s,) from the first one on.
 
-    Equation: per step h, `h (y_1 + y_2) / 2 + h^2 (y'_1 - y'_2) / 12` with their derivatives y' =
+    Equation: per step h, `h (y_1 + y_2) / 2 + h^2 (y'_1 - y'_2) / 12` with their
+    derivatives y' =
     `rates` (s, m): exact for cubics.
     """
     step = jnp.diff(time)[:, None]
-    pieces = step / 2 * (values[1:] + values[:-1]) + step**2 / 12 * (rates[:-1] - rates[1:])
+    pieces = step / 2 * (values[1:] + values[:-1]) + step**2 / 12 * (
+        rates[:-1] - rates[1:]
+    )
     return jnp.concatenate([jnp.zeros_like(values[:1]), jnp.cumsum(pieces, axis=0)])

@@ -22,30 +22,36 @@ class Poisson(Law):
     """Poisson's restitution of impulses: compression to rest, then expansion.
 
     Equation: compression `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`; expansion
-    `p_e = e p_c + s`, `0 <= gamma+ = gamma_c + W p_e  _|_  s >= 0`; `p = p_c + p_e`. With friction
-    (W_nt p_t added) `p_tc in -mu p_c Sgn(u_c)` and `p_te in -mu p_e Sgn(u+ + e_t u-)`.
+    `p_e = e p_c + s`, `0 <= gamma+ = gamma_c + W p_e  _|_  s >= 0`; `p = p_c + p_e`.
+    With friction (W_nt p_t added) `p_tc in -mu p_c Sgn(u_c)` and
+    `p_te in -mu p_e Sgn(u+ + e_t u-)`.
 
     Args:
         restitution: kinetic coefficient e in [0, 1], scalar or one per contact (m,).
-        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no
+            friction.
         tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking in expansion is
             `v_t+ = -e_t v_t-`, as far as the expansion's friction reaches.
         allow_above_one: let e exceed 1, which dispersion in a chain would need.
 
-    Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where v+ depends on how
-    they share p_c (the least one is taken): without friction where their e differ, with friction
-    where another share expands to another v+ (up to 3 contacts: those with the least or most p_c of
-    a contact are tried; of more contacts where their e differ); `energy_gain` where e
+    Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where v+
+    depends on how they share p_c (the least one is taken): without friction where their
+    e differ, with friction where another share expands to another v+ (up to 3 contacts:
+    those with the least or most p_c of a contact are tried; of more contacts where
+    their e differ); `energy_gain` where e
     above 1 creates energy. With friction also as in `Moreau`.
 
-    Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j up to 1:
-    of all s >= 0 the law takes that of least energy, and `s = (e_max - e_j) p_c` is one of them.
+    Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j
+    up to 1: of all s >= 0 the law takes that of least energy, and
+    `s = (e_max - e_j) p_c` is one of them.
 
-    Derivatives are one-sided where a contact is about to take part in either stage; where several
-    are (a block that falls flat at e = 0, given per contact), those of one of the sides.
+    Derivatives are one-sided where a contact is about to take part in either stage;
+    where several are (a block that falls flat at e = 0, given per contact), those of
+    one of the sides.
 
-    Source: Pfeiffer and Glocker (1996); Brogliato, Nonsmooth Mechanics (2016), (6.76)-(6.79) with
-    the errata of `docs/equations.md`; e_t as in the kinematic laws, (6.54).
+    Source: Pfeiffer and Glocker (1996); Brogliato, Nonsmooth Mechanics (2016),
+    (6.76)-(6.79) with the errata of `docs/equations.md`; e_t as in the kinematic laws,
+    (6.54).
 
     >>> import jimpact as ji
     >>> law = ji.Poisson([0.4, 1.0])
@@ -69,16 +75,22 @@ class Poisson(Law):
         *,
         allow_above_one: bool = False,
     ):
-        """Set the fields; their declarations check them. Without friction e_t must be 0."""
-        self.restitution, self.allow_above_one = restitution, allow_above_one
+        """Set the fields; their declarations check them. Without friction e_t must be
+        0.
+        """
+        self.restitution = restitution
+        self.allow_above_one = allow_above_one
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
         )
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses `p = (1 + e) p_c + s`, p_c and s each by a complementarity problem."""
-        mu, e_t = self.friction, self.tangential_restitution
+        """Impulses `p = (1 + e) p_c + s`, p_c and s each by a complementarity
+        problem.
+        """
+        mu = self.friction
+        e_t = self.tangential_restitution
         if mu is not None and e_t is not None:
             return self._with_friction(contact, mu, e_t)
         w = contact.delassus
@@ -89,20 +101,29 @@ class Poisson(Law):
         if self.restitution.ndim == 1 and not is_regular(w):
             free = _free_columns(as_matrix(w), compression.z > 0)
             ambiguous = _depends_on_sharing(as_matrix(w), self.restitution, free)
-            code = jnp.maximum(code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"]))
+            code = jnp.maximum(
+                code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"])
+            )
         return Impulses(compression.z + returned + supplement.z, None, code)
 
-    def _with_friction(self, contact: Contact, mu: jax.Array, e_t: jax.Array) -> Impulses:
-        """Impulses of compression and of expansion, each by a friction problem, see the class.
+    def _with_friction(
+        self, contact: Contact, mu: jax.Array, e_t: jax.Array
+    ) -> Impulses:
+        """Impulses of compression and of expansion, each by a friction problem, see the
+        class.
 
         Equation: `p = (1 + e) p_c + s`, `p_t = p_tc + p_te`.
         """
         assert contact.slip is not None  # see `check_law`
-        a, gamma = contact.whole_delassus, contact.gap_velocity
-        mu, e = mu * jnp.ones_like(gamma), self.restitution * jnp.ones_like(gamma)
+        a = contact.whole_delassus
+        gamma = contact.gap_velocity
+        mu = mu * jnp.ones_like(gamma)
+        e = self.restitution * jnp.ones_like(gamma)
         e_t = jnp.repeat(e_t * jnp.ones_like(mu), contact.tangents)
         first = solve(a, gamma, contact.slip, mu, complementary=True)
-        expansion = _Expansion(a, jnp.concatenate([gamma, (1 + e_t) * contact.slip]), mu, e)
+        expansion = _Expansion(
+            a, jnp.concatenate([gamma, (1 + e_t) * contact.slip]), mu, e
+        )
         compression = jnp.concatenate([first.normal, first.tangential])
         second, velocity = expansion.after(compression)
         code = jnp.maximum(first.status, second.status)
@@ -113,7 +134,9 @@ class Poisson(Law):
         if first.shares is not None:
             other = _expands_otherwise(expansion, compression, velocity, first.shares)
             ambiguous = ambiguous | other
-        code = jnp.maximum(code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"]))
+        code = jnp.maximum(
+            code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"])
+        )
         p = (1 + e) * first.normal + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
 
@@ -129,35 +152,50 @@ class _Expansion(NamedTuple):
     def after(self, compression: jax.Array) -> tuple[FrictionImpulses, jax.Array]:
         """Impulses (s, p_te) of expansion after (p_c, p_tc) of `compression` (m + t,).
 
-        Also returns the velocities `gamma+` and `u+ + e_t u-` (m + t,) to which they lead.
+        Also returns the velocities `gamma+` and `u+ + e_t u-` (m + t,) to which they
+        lead.
         """
-        m, zero = len(self.friction), precision(self.before.dtype)
+        m = len(self.friction)
+        zero = precision(self.before.dtype)
         p_c = compression[:m]
         returned = self.restitution * p_c
         impulse = compression + jnp.pad(returned, (0, len(compression) - m))
         size = jnp.abs(self.before) + jnp.abs(self.matrix) @ jnp.abs(impulse)
         # rounding must not move contacts that compression has brought to rest
-        velocity = without_rounding(self.before + self.matrix @ impulse, zero.accumulated * size)
+        velocity = without_rounding(
+            self.before + self.matrix @ impulse, zero.accumulated * size
+        )
         # e p_c loads friction; eps^2 p_c keeps its slope in e at e = 0
         load = returned + zero.eps**2 * p_c
         x = solve(
-            self.matrix, velocity[:m], velocity[m:], self.friction, complementary=True, load=load
+            self.matrix,
+            velocity[:m],
+            velocity[m:],
+            self.friction,
+            complementary=True,
+            load=load,
         )
         return x, velocity + self.matrix @ jnp.concatenate([x.normal, x.tangential])
 
 
 def _expands_otherwise(
-    expansion: _Expansion, compression: jax.Array, velocity: jax.Array, shares: jax.Array
+    expansion: _Expansion,
+    compression: jax.Array,
+    velocity: jax.Array,
+    shares: jax.Array,
 ) -> jax.Array:
-    """True () where other `shares` (k, m + t) of the impulses of compression lead to another v+.
+    """True () where other `shares` (k, m + t) of the impulses of compression lead to
+    another v+.
 
-    `velocity` (m + t,) is that to which the impulses of `compression` (m + t,) expand, see
-    `_Expansion.after`. Redundant contacts can share the impulse of compression in several ways.
+    `velocity` (m + t,) is that to which the impulses of `compression` (m + t,) expand,
+    see `_Expansion.after`. Redundant contacts can share the impulse of compression in
+    several ways.
     """
     expansion, x, velocity, shares = jax.lax.stop_gradient(
         (expansion, compression, velocity, shares)
     )
-    m, root = len(expansion.friction), precision(x.dtype).root
+    m = len(expansion.friction)
+    root = precision(x.dtype).root
     returned = expansion.restitution[None] * (shares - x[None])[:, :m]
     needed = jnp.any(jnp.abs(returned) > root * jnp.abs(x).max())
 
@@ -165,7 +203,9 @@ def _expands_otherwise(
         """True () where velocities differ for any of these shares."""
 
         def differs(share: jax.Array) -> jax.Array:
-            """True () where velocities differ after this share (m + t,), if it has a solution."""
+            """True () where velocities differ after this share (m + t,), if it has a
+            solution.
+            """
             other, after = expansion.after(share)
             apart = jnp.abs(after - velocity) > root * jnp.abs(expansion.before).max()
             return jnp.any(apart) & (other.status < CODE["infeasible"])
@@ -177,22 +217,27 @@ def _expands_otherwise(
 
 
 def _free_columns(w: jax.Array, loaded: jax.Array) -> jax.Array:
-    """Columns (m, m) that span the changes of loaded impulses (m,) that leave W p as it is.
+    """Columns (m, m) that span the changes of loaded impulses (m,) that leave W p as it
+    is.
 
-    Equation: `D^-1 P`, P the projector on the null space of `D^-1 W D^-1` between loaded contacts,
-    `D = diag(sqrt(W_jj))`.
+    Equation: `D^-1 P`, P the projector on the null space of `D^-1 W D^-1` between
+    loaded contacts, `D = diag(sqrt(W_jj))`.
     """
     norm = jax.lax.stop_gradient(jnp.sqrt(jnp.diagonal(w)))
     both = loaded[:, None] & loaded[None, :]
     unit = jnp.eye(len(loaded), dtype=w.dtype)
-    projector, _ = null_projector(jnp.where(both, w / (norm[:, None] * norm[None, :]), unit))
+    projector, _ = null_projector(
+        jnp.where(both, w / (norm[:, None] * norm[None, :]), unit)
+    )
     return projector / norm[:, None]
 
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Array:
-    """True () where `W diag(e) p_c` differs among p_c (m,) that differ by columns of `free` (m, m).
+    """True () where `W diag(e) p_c` differs among p_c (m,) that differ by columns of
+    `free` (m, m).
 
-    Equation: an entry of `D^-1 W diag(e) free`, `D = diag(sqrt(W_jj))`, is more than rounding.
+    Equation: an entry of `D^-1 W diag(e) free`, `D = diag(sqrt(W_jj))`, is more than
+    rounding.
     """
     w, e = jax.lax.stop_gradient((w, e))
     norm = jnp.sqrt(jnp.diagonal(w))

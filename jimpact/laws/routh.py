@@ -9,28 +9,31 @@ from jimpact.tools.compiling import full_precision
 
 
 class Routh(Law):
-    """Rigid contacts whose impulses grow in constant ratios; one e for the work of all of them.
+    """Rigid contacts whose impulses grow in constant ratios; one e for their work.
 
-    Equation: `p = s p_c` with `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`. The net work
-    `-(2 s - s^2) p_c^T W p_c / 2` of all contacts is least at s = 1, the end of compression, and
-    the share e^2 of it is given back (energetic restitution): s = 1 + e. Of unequal e_j, e^2 is
-    the mean of e_j^2, weighted by what each contact takes up in compression, `-p_cj gamma_j- / 2`.
+    Equation: `p = s p_c` with `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`. The net
+    work
+    `-(2 s - s^2) p_c^T W p_c / 2` of all contacts is least at s = 1, the end of
+    compression, and the share e^2 of it is given back (energetic restitution): s = 1 +
+    e. Of unequal e_j, e^2 is the mean of e_j^2, weighted by what each contact takes up
+    in compression, `-p_cj gamma_j- / 2`.
 
-    Of contacts that approach or rest it is Moreau's law with one e, and where one contact hits
-    others at rest that of Hurmuzlu and Marghitu: no dispersion. It agrees with `LZB` for one
-    contact, and for contacts with kinetic angle pi/2 and one e.
+    Of contacts that approach or rest it is Moreau's law with one e, and where one
+    contact hits others at rest that of Hurmuzlu and Marghitu: no dispersion. It agrees
+    with `LZB` for one contact, and for contacts with kinetic angle pi/2 and one e.
 
     Args:
         restitution: energetic coefficient e in [0, 1], scalar or one per contact (m,).
 
-    Status: `inadmissible_velocity` where a contact separates before the impact and is pressed in
-    it; `impulse_not_unique` for redundant contacts.
+    Status: `inadmissible_velocity` where a contact separates before the impact and is
+    pressed in it; `impulse_not_unique` for redundant contacts.
 
-    Derivatives are one-sided where a contact is about to take part. Where e of the impact is 0,
-    those in each e_j are one-sided, too: `sqrt` of the contact's share of the work.
+    Derivatives are one-sided where a contact is about to take part. Where e of the
+    impact is 0, those in each e_j are one-sided, too: `sqrt` of the contact's share of
+    the work.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), 6.4.3, on Bowling and Rodriguez; Routh (1897).
-    How the increments are shared is this library's reading of it.
+    Source: Brogliato, Nonsmooth Mechanics (2016), 6.4.3, on Bowling and Rodriguez;
+    Routh (1897). How the increments are shared is this library's reading of it.
 
     >>> import jimpact as ji
     >>> three_balls = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
@@ -42,15 +45,22 @@ class Routh(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """`p = (1 + e) p_c` (m,) [N s] with the impulses p_c of compression, e of all contacts."""
-        w, gamma, e = contact.delassus, contact.gap_velocity, self.restitution
+        """`p = (1 + e) p_c` (m,) [N s] with the impulses p_c of compression, e of all
+        contacts.
+        """
+        w = contact.delassus
+        gamma = contact.gap_velocity
+        e = self.restitution
         compression = solve_lcp(w, gamma)
         if e.ndim:
-            work = compression.z * jnp.maximum(-gamma, 0.0)  # twice that taken up by each contact
+            # twice that taken up by each contact
+            work = compression.z * jnp.maximum(-gamma, 0.0)
             total = jnp.sum(work)
             share = work / jnp.where(total > 0, total, 1.0)
             returned = jnp.sum(e**2 * share)  # e^2 of the whole impact
             root = jnp.sqrt(jnp.where(share > 0, share, 1.0))
             at_zero = jnp.sum(jnp.where(share > 0, root * e, 0.0))  # 0, with its slopes
-            e = jnp.where(returned > 0, jnp.sqrt(jnp.where(returned > 0, returned, 1.0)), at_zero)
+            e = jnp.where(
+                returned > 0, jnp.sqrt(jnp.where(returned > 0, returned, 1.0)), at_zero
+            )
         return Impulses((1 + e) * compression.z, None, compression.code)

@@ -44,32 +44,38 @@ from jimpact.tools.precision import precision
 from jimpact.tools.progress import counting_bar
 from jimpact.tools.status import STATUS
 
-# Smallest tolerance over the reference's rtol. Ten times more would refuse 1e-6; ten times
+# Smallest tolerance over the reference's rtol. Ten times more would refuse 1e-6; ten
+# times
 # less would let the reference's error enter.
 FINEST_TOLERANCE = 100
-# The error of a loosened rtol, and the distance between LZB and Compliant, count as small below the
-# tolerance over this. Ten times more costs time; ten times less moves the verdict.
+# The error of a loosened rtol, and the distance between LZB and Compliant, count as
+# small below the tolerance over this. Ten times more costs time; ten times less moves
+# the verdict.
 SMALL_PART = 10
 # Largest rtol that is advised: beyond, the steps of the integrator are no longer fewer.
 COARSEST_RTOL = 1e-3
 
 # Range of an unknown ratio of two stiffnesses: contacts of bodies of one kind.
 UNKNOWN_RANGE = (0.1, 10.0)
-# Stiffnesses with every ratio at an end of its range, all of them up to this number, else as many
-# at random.
+# Stiffnesses with every ratio at an end of its range, all of them up to this number,
+# else as many at random.
 CORNERS = 64
-ALONE = (0.0, 1 / 3, 2 / 3, 1.0)  # places in a ratio's range (of its logarithm) tried by itself
-NUDGE = 0.02  # change of ln k for the sensitivity; its square is far below what is printed
+# places in a ratio's range (of its logarithm) tried by itself
+ALONE = (0.0, 1 / 3, 2 / 3, 1.0)
+# change of ln k for the sensitivity; its square is far below what is printed
+NUDGE = 0.02
 
-# Open contacts of a body that turns (all but chains) take part where they can close while others
-# are loaded: within this time [s], longer than hard bodies touch ...
+# Open contacts of a body that turns (all but chains) take part where they can close
+# while others are loaded: within this time [s], longer than hard bodies touch ...
 LONGEST_CONTACT = 1e-2
-# ... or, where the stiffness is known, within this many times delta_c / v, about a third of the
-# duration of one collision. Ten times more: contacts far away require a stiffness.
+# ... or, where the stiffness is known, within this many times delta_c / v, about a
+# third of the duration of one collision. Ten times more: contacts far away require a
+# stiffness.
 CONTACT_TIMES = 10
 
 CHUNK = 64  # rows computed together
-FEW_CONTACTS = 8  # up to this number of contacts a chunk is always full, so that it compiles once
+# up to this number of contacts a chunk is always full, so that it compiles once
+FEW_CONTACTS = 8
 LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
 ROUNDS = 7  # of the timing
 
@@ -77,9 +83,10 @@ ROUNDS = 7  # of the timing
 class Situation(NamedTuple):
     """Scene and v- with derived quantities that decide between the laws.
 
-    `scene` is as passed, but contacts too far to take part (`far`, (m,)) have an infinite gap;
-    `touching` has all contacts closed that take part; `gapped` (m,) marks the open contacts that
-    can close while others are loaded; `distance` is the norm of differences of velocities.
+    `scene` is as passed, but contacts too far to take part (`far`, (m,)) have an
+    infinite gap; `touching` has all contacts closed that take part; `gapped` (m,) marks
+    the open contacts that can close while others are loaded; `distance` is the norm of
+    differences of velocities.
     """
 
     scene: Scene
@@ -103,20 +110,29 @@ class Trial(NamedTuple):
     law: Law
     scene: Scene
 
-    def varied(self, velocity: np.ndarray, stiffness: np.ndarray) -> tuple[dict[str, Any], int]:
-        """Arguments to vary, by name with a row for each impact, and the rows of a batch.
+    def varied(
+        self, velocity: np.ndarray, stiffness: np.ndarray
+    ) -> tuple[dict[str, Any], int]:
+        """Arguments to vary, by name with a row for each impact, and the rows of a
+        batch.
 
-        Stiffness (r, m) [N/m^eta] of a law that has one, else v- (1, n) [m/s]: one impact.
+        Stiffness (r, m) [N/m^eta] of a law that has one, else v- (1, n) [m/s]: one
+        impact.
         """
         rows, contacts = stiffness.shape
         if "stiffness" not in free_parameters_of(self.law):
             return {"velocity": velocity[None, :]}, max(1, LANES // contacts**2)
-        return {"stiffness": stiffness}, CHUNK if contacts <= FEW_CONTACTS else min(rows, CHUNK)
+        return {"stiffness": stiffness}, CHUNK if contacts <= FEW_CONTACTS else min(
+            rows, CHUNK
+        )
 
     def run(self, velocity: np.ndarray, varied: dict[str, Any]) -> Outcomes:
-        """Outcomes of impacts at v- (n,), one for each row of the arguments `varied`."""
+        """Outcomes of impacts at v- (n,), one for each row of the arguments
+        `varied`.
+        """
         scene = self.scene
-        if scene.gaps is None:  # scenes with and without gaps share one compiled program
+        # scenes with and without gaps share one compiled program
+        if scene.gaps is None:
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
         return varied_impacts(self.law, scene, jnp.asarray(velocity), varied)
 
@@ -137,31 +153,37 @@ def advise(
     timing: bool = True,
     progress: float | None = None,
 ) -> Advice:
-    """Find the simplest law whose v+ agrees with the bistiffness reference within `tolerance`.
+    """Find the simplest law whose v+ agrees with the bistiffness reference.
 
-    Equation: the error of a law is `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the difference between
-    its v+ and the reference's: a ratio of energy norms, which does not mix m/s and rad/s.
+    Equation: the error of a law is `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the
+    difference between its v+ and the reference's: a ratio of energy norms, which does
+    not mix m/s and rad/s.
 
-    The reference is `LZB`, or `Compliant` where the two differ: in LZB an opened contact re-closes
-    as soon as its bodies approach, in `Compliant` only after the gap that opened has closed (as
-    with a wall). Only `Compliant` follows open contacts that can close while others are loaded;
-    this requires the absolute stiffness. Each law is compared with it over the
-    unknown stiffness ratios: varied one at a time, at the corners of their ranges, and at
-    log-uniform samples. Open contacts of bodies that turn (of all scenes but chains) take no part
-    if they cannot close during the impact.
+    The reference is `LZB`, or `Compliant` where the two differ: in LZB an opened
+    contact re-closes as soon as its bodies approach, in `Compliant` only after the gap
+    that opened has closed (as with a wall). Only `Compliant` follows open contacts that
+    can close while others are loaded; this requires the absolute stiffness. Each law is
+    compared with it over the
+    unknown stiffness ratios: varied one at a time, at the corners of their ranges, and
+    at log-uniform samples. Open contacts of bodies that turn (of all scenes but chains)
+    take no part if they cannot close during the impact.
 
     Args:
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
-        tolerance: of the error; at least 100 times the reference's rtol (1e-8 in float64).
+        tolerance: of the error; at least 100 times the reference's rtol (1e-8 in
+            float64).
         restitution: e in [0, 1], scalar or (m,).
-        stiffness: k > 0, scalar or (m,) [N / m^eta]; None: only their ratio's range is known.
+        stiffness: k > 0, scalar or (m,) [N / m^eta]; None: only their ratio's range is
+            known.
         exponent: eta >= 1, as in `LZB`.
-        friction: Coulomb's mu >= 0, scalar or (m,), of every law (e_t = 0); None: no friction.
-        tangential_stiffness: kappa > 0, scalar or (m,), of `LZB` and `Compliant`, with `friction`;
-            None: contacts stick rigidly.
-        stiffness_range: low and high factor on each unknown ratio k_j / k_first within a group of
-            coupled contacts, or on each k_j if absolute stiffness matters; default: (0.1, 10)
+        friction: Coulomb's mu >= 0, scalar or (m,), of every law (e_t = 0); None: no
+            friction.
+        tangential_stiffness: kappa > 0, scalar or (m,), of `LZB` and `Compliant`, with
+            `friction`; None: contacts stick rigidly.
+        stiffness_range: low and high factor on each unknown ratio k_j / k_first within
+            a group of coupled contacts, or on each k_j if absolute stiffness matters;
+            default: (0.1, 10)
             if `stiffness` is None, else (1, 1).
         samples: number of log-uniform samples.
         seed: of the samples.
@@ -172,19 +194,24 @@ def advise(
         `Advice`; `print` gives half a page.
 
     Raises:
-        ValueError: shapes or ranges; friction on a scene without tangents; gaps that matter, or
-            unequal exponents, without stiffness.
+        ValueError: shapes or ranges; friction on a scene without tangents; gaps that
+            matter, or unequal exponents, without stiffness.
         RuntimeError: the reference fails on this scene.
 
     Source: comparisons as in Brogliato, Nonsmooth Mechanics (2016), section 6.3.3.
 
     >>> import jimpact as ji
-    >>> advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
+    >>> advice = ji.advise(
+    ...     ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False
+    ... )
     >>> advice.name, advice.reason
     ('newton', 'single contact')
     """
     v = as_velocity(scene, velocity, finite=True)
-    k = np.ones(()) if stiffness is None else stiffness
+    if stiffness is None:
+        k = np.ones(())
+    else:
+        k = stiffness
     parameters = {"restitution": restitution, "stiffness": k, "exponent": exponent}
     if friction is not None:
         parameters["friction"] = friction
@@ -203,15 +230,19 @@ def advise(
     check_law(law, scene, v.dtype)
     situation = situation_of(scene, np.asarray(v), law, stiffness is not None)
     mixed = len(np.unique(np.asarray(exponent, float))) > 1
-    # gaps, and contacts with unequal exponents, have no outcome in ratios of stiffness alone
+    # gaps, and contacts with unequal exponents, have no outcome in ratios of stiffness
+    # alone
     absolute = bool(situation.gapped.any()) or (mixed and bool(situation.coupled))
     if absolute and stiffness is None:
         raise ValueError(_missing_stiffness(situation))
     nominal = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
     unknown = _unknown_stiffnesses(situation, nominal, factors, absolute)
     tried = _stiffnesses_to_try(nominal, unknown, samples, seed)
-    laws, options = trials(situation, law), (float(tolerance), timing, progress)
-    return _simplest_law(situation, laws, unknown, tried, slice(-samples, None), *options)
+    laws = trials(situation, law)
+    options = (float(tolerance), timing, progress)
+    return _simplest_law(
+        situation, laws, unknown, tried, slice(-samples, None), *options
+    )
 
 
 def _simplest_law(
@@ -224,14 +255,18 @@ def _simplest_law(
     timing: bool,
     progress: float | None,
 ) -> Advice:
-    """Compare all laws with the reference, and advise the simplest one within `tolerance`.
+    """Compare all laws with the reference, and advise the simplest one within
+    `tolerance`.
 
-    Each runs over stiffnesses k (r, m), row 0 the nominal ones, in which the `unknown` ones vary;
-    `random` are the rows drawn at random. The reference is Compliant where gaps count or contacts
-    re-close, else LZB.
+    Each runs over stiffnesses k (r, m), row 0 the nominal ones, in which the `unknown`
+    ones vary; `random` are the rows drawn at random. The reference is Compliant where
+    gaps count or contacts re-close, else LZB.
     """
     v = situation.velocity
-    each = {name: partial(_outcomes, law, v, progress=progress) for name, law in laws.items()}
+    each = {
+        name: partial(_outcomes, law, v, progress=progress)
+        for name, law in laws.items()
+    }
     outcomes, left_out = at_points(each, k)
     for name in ("lzb", "compliant"):
         if name in left_out:
@@ -239,16 +274,29 @@ def _simplest_law(
     laws = {name: laws[name] for name in outcomes}
     apart = _reclosing_distance(situation, outcomes)  # of LZB and Compliant
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
-    name = "compliant" if follows_gaps else "lzb"
+    if follows_gaps:
+        name = "compliant"
+    else:
+        name = "lzb"
     outcomes[name].check_first(f"The reference law {name} fails on this scene")
     reference = outcomes[name].where_usable()
-    costs = _costs(laws, v, k) if timing else {}
+    if timing:
+        costs = _costs(laws, v, k)
+    else:
+        costs = {}
     candidates = {
-        key: _candidate(law, situation, outcomes[key], reference, random, costs.get(key))
+        key: _candidate(
+            law, situation, outcomes[key], reference, random, costs.get(key)
+        )
         for key, law in laws.items()
     }
-    suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
-    chosen = suffice[0] if suffice else name
+    suffice = [
+        key for key, c in candidates.items() if c.usable and c.worst <= tolerance
+    ]
+    if suffice:
+        chosen = suffice[0]
+    else:
+        chosen = name
     if "rtol" in options_of(type(laws[chosen].law)):
         candidates[chosen] = _with_coarsest_rtol(
             candidates[chosen], situation, reference, tolerance
@@ -265,7 +313,9 @@ def _simplest_law(
         velocity=v,
         gap_velocity=situation.gap_velocity,
         candidates=candidates,
-        blocks=_with_simplest_laws(situation, candidates, outcomes, reference, tolerance),
+        blocks=_with_simplest_laws(
+            situation, candidates, outcomes, reference, tolerance
+        ),
         stiffness=k[0],
         unknown=_with_effects(situation, unknown, reference, tolerance),
         rows=len(k),
@@ -276,17 +326,25 @@ def _simplest_law(
     )
 
 
-def _checked_range(factors: tuple[float, float] | None, known: bool) -> tuple[float, float]:
-    """Low and high factor on each unknown stiffness, checked; `known`: its value was given."""
+def _checked_range(
+    factors: tuple[float, float] | None, known: bool
+) -> tuple[float, float]:
+    """Low and high factor on each unknown stiffness, checked; `known`: its value was
+    given.
+    """
     if factors is None:
-        return (1.0, 1.0) if known else UNKNOWN_RANGE
+        if known:
+            return (1.0, 1.0)
+        return UNKNOWN_RANGE
     ends = np.asarray(factors)
     check_shape("stiffness_range", ends, (2,), "low and high factor")
     check_values("stiffness_range", ends, low=0.0, open_low=True)
-    low, high = float(ends[0]), float(ends[1])
+    low = float(ends[0])
+    high = float(ends[1])
     if low > high:
         raise ValueError(
-            f"Argument `stiffness_range` must have low <= high, but has value ({low:g}, {high:g})."
+            f"Argument `stiffness_range` must have low <= high, but has value "
+            f"({low:g}, {high:g})."
         )
     return low, high
 
@@ -296,17 +354,25 @@ def _missing_stiffness(situation: Situation) -> str:
     if situation.gapped.any():
         named = ", ".join(str(j + 1) for j in np.flatnonzero(situation.gapped))
         return (
-            "Argument `stiffness` must be given [N/m^eta] where open contacts can close while "
-            f"others are loaded (contact {named}): gaps count in units of the indentation. "
+            "Argument `stiffness` must be given [N/m^eta] where open contacts can "
+            "close while "
+            f"others are loaded (contact {named}): gaps count in units of the "
+            f"indentation. "
             "Set their gaps to inf if they take no part."
         )
-    return "Argument `stiffness` must be given where exponents differ: ratios do not suffice then."
+    return (
+        "Argument `stiffness` must be given where exponents differ: ratios do not "
+        "suffice then."
+    )
 
 
-# ------------------------------------------------------- the scene, and what is tried on it
+# ------------------------------------------------------- the scene, and what is tried
+# on it
 
 
-def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> Situation:
+def situation_of(
+    scene: Scene, velocity: np.ndarray, law: LZB, known: bool
+) -> Situation:
     """Blocks of coupled contacts, and the gaps that count, of a scene at v- (n,) [m/s].
 
     `known`: the stiffness of `law` is that of the contacts, not a placeholder.
@@ -318,7 +384,8 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
         assert scene.gaps is not None
         scene = with_gaps(scene, jnp.where(jnp.asarray(far), jnp.inf, scene.gaps))
     blocks = blocks_of(scene, gamma, np.flatnonzero(~far), law.friction is not None)
-    acting, gapped = np.zeros((2, len(gamma)), bool)  # in a block that approaches; and open
+    # in a block that approaches; and open
+    acting, gapped = np.zeros((2, len(gamma)), bool)
     for block in blocks:
         contacts = list(block.contacts)
         acting[contacts] = block.approaches
@@ -335,19 +402,23 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
 def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.ndarray:
     """Mask (m,) of contacts that can close while others are loaded; in a chain all.
 
-    Equation: `gap_j <= sqrt(W_jj 2 T-) t`: without a gain of energy no gap velocity exceeds the
-    root. The loads last t = `LONGEST_CONTACT`, or `CONTACT_TIMES delta_c / max(-gamma-)` if the
-    stiffness is `known`.
+    Equation: `gap_j <= sqrt(W_jj 2 T-) t`: without a gain of energy no gap velocity
+    exceeds the root. The loads last t = `LONGEST_CONTACT`, or
+    `CONTACT_TIMES delta_c / max(-gamma-)` if the stiffness is `known`.
     """
     if scene.walls is not None or scene.gaps is None:
         return np.ones(scene.contacts, bool)
-    mass, normals = dense_mass(scene), np.asarray(scene.normals)
-    diagonal = np.sum(normals * np.asarray(solve_mass(scene, scene.normals)), axis=0)  # W_jj
+    mass = dense_mass(scene)
+    normals = np.asarray(scene.normals)
+    # W_jj
+    diagonal = np.sum(normals * np.asarray(solve_mass(scene, scene.normals)), axis=0)
     fastest = np.sqrt(diagonal * (velocity @ mass @ velocity))
     duration = LONGEST_CONTACT
     approach = float(-np.min(normals.T @ velocity))
     if known and approach > 0:
-        delta = np.asarray(gap_scale(scene, law, velocity).delta)[np.asarray(scene.closed)]
+        delta = np.asarray(gap_scale(scene, law, velocity).delta)[
+            np.asarray(scene.closed)
+        ]
         duration = CONTACT_TIMES * float(delta.max(initial=0.0)) / approach
     return np.asarray(scene.gaps) <= fastest * duration
 
@@ -357,21 +428,28 @@ def blocks_of(
 ) -> tuple[ContactBlock, ...]:
     """Blocks of the given `contacts` (indices), with their kinetic angles [deg].
 
-    Two contacts share a block if they are coupled (W_ij is not 0; with `friction` also between
-    normals and tangents), directly or through others. `gamma` (m,) [m/s] are gap velocities.
+    Two contacts share a block if they are coupled (W_ij is not 0; with `friction` also
+    between normals and tangents), directly or through others. `gamma` (m,) [m/s] are
+    gap velocities.
     """
     cosine = _largest_cosines(scene, friction)[np.ix_(contacts, contacts)]
     angle = np.degrees(np.asarray(kinetic_angles(scene)))
-    coupled = cosine > precision(cosine.dtype).accumulated  # rounding of normals and of M^-1
+    # rounding of normals and of M^-1
+    coupled = cosine > precision(cosine.dtype).accumulated
     label = components(coupled | np.eye(len(contacts), dtype=bool))
     blocks = []
     for each in np.unique(label):
         members = np.flatnonzero(label == each)
         inside = np.ix_(contacts[members], contacts[members])
         angles = angle[inside][np.triu(coupled[np.ix_(members, members)], 1)]
-        ends = (float(angles.min()), float(angles.max())) if angles.size else None
+        if angles.size:
+            ends = (float(angles.min()), float(angles.max()))
+        else:
+            ends = None
         joined = contacts[members]
-        blocks.append(ContactBlock(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends))
+        blocks.append(
+            ContactBlock(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends)
+        )
     return tuple(blocks)
 
 
@@ -386,20 +464,28 @@ def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
     assert scene.tangents is not None
     columns = jnp.concatenate([scene.normals, scene.tangents], axis=1)
     w = np.asarray(columns.T @ solve_mass(scene, columns))
-    size, m = np.sqrt(np.diag(w)), scene.contacts
+    size = np.sqrt(np.diag(w))
+    m = scene.contacts
     # the contact of each column
     contact = np.concatenate([np.arange(m), np.repeat(np.arange(m), (len(w) - m) // m)])
     largest = np.zeros((m, m))
-    np.maximum.at(largest, (contact[:, None], contact[None, :]), np.abs(w / np.outer(size, size)))
+    np.maximum.at(
+        largest, (contact[:, None], contact[None, :]), np.abs(w / np.outer(size, size))
+    )
     return largest
 
 
 def _unknown_stiffnesses(
-    situation: Situation, stiffness: np.ndarray, factors: tuple[float, float], absolute: bool
+    situation: Situation,
+    stiffness: np.ndarray,
+    factors: tuple[float, float],
+    absolute: bool,
 ) -> tuple[Unknown, ...]:
-    """Stiffnesses of coupled contacts known only to a factor; none if both factors are equal.
+    """Stiffnesses of coupled contacts known only to a factor; none if both factors are
+    equal.
 
-    Ratios to the first contact of the block, unless the `absolute` stiffness [N/m^eta] counts.
+    Ratios to the first contact of the block, unless the `absolute` stiffness [N/m^eta]
+    counts.
     """
     if factors[0] == factors[1]:
         return ()
@@ -407,9 +493,11 @@ def _unknown_stiffnesses(
     for block in situation.coupled:
         first = block.contacts[0]
         for j in block.contacts if absolute else block.contacts[1:]:
-            name, nominal = f"k{j + 1}", float(stiffness[j])
+            name = f"k{j + 1}"
+            nominal = float(stiffness[j])
             if not absolute:
-                name, nominal = f"{name}/k{first + 1}", nominal / float(stiffness[first])
+                name = f"{name}/k{first + 1}"
+                nominal = nominal / float(stiffness[first])
             low, high = (nominal * factor for factor in factors)
             unknown.append(Unknown(name, j, nominal, low, high))
     return tuple(unknown)
@@ -418,12 +506,14 @@ def _unknown_stiffnesses(
 def _stiffnesses_to_try(
     stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int
 ) -> np.ndarray:
-    """Stiffnesses (r, m) to try: rows of changes of ln k of the unknown ones from the nominal.
+    """Stiffnesses (r, m) to try: rows of changes of ln k of the unknown ones from the
+    nominal.
 
-    In order: no change; each unknown by itself, at the places `ALONE` of its range and by +- NUDGE;
-    corners of the ranges of all; `samples` log-uniform draws.
+    In order: no change; each unknown by itself, at the places `ALONE` of its range and
+    by +- NUDGE; corners of the ranges of all; `samples` log-uniform draws.
     """
-    count, random = len(unknown), np.random.default_rng(seed)
+    count = len(unknown)
+    random = np.random.default_rng(seed)
     if count == 0:
         return stiffness[None, :]
     low = np.log([u.low / u.nominal for u in unknown])
@@ -447,13 +537,20 @@ def _stiffnesses_to_try(
 
 
 def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
-    """Laws by name with e, k, eta and mu of `law`, the simplest first, and the scenes to try.
+    """Laws by name with e, k, eta and mu of `law`, the simplest first, and the scenes
+    to try.
 
-    A law that uses gaps gets the scene with gaps that count; others take its contacts as closed.
+    A law that uses gaps gets the scene with gaps that count; others take its contacts
+    as closed.
     """
-    v, m = situation.velocity, situation.scene.contacts
-    e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
-    mu, touching = law.friction, situation.touching
+    v = situation.velocity
+    m = situation.scene.contacts
+    e, k = (
+        jnp.broadcast_to(x, (m,)).astype(v.dtype)
+        for x in (law.restitution, law.stiffness)
+    )
+    mu = law.friction
+    touching = situation.touching
     kappa = law.tangential_stiffness
     gapped = bool(situation.gapped.any())
     known = dict(zip(ADVISED, (e, k, law.exponent, mu, kappa), strict=True))
@@ -468,41 +565,54 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     }
 
 
-# -------------------------------------------------------------------------- running the laws
+# -------------------------------------------------------------------------- running the
+# laws
 
 
 def _outcomes(
     trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
-    """Outcomes of a law at v- (n,) over stiffnesses (r, m); one outcome of a law without them."""
+    """Outcomes of a law at v- (n,) over stiffnesses (r, m); one outcome of a law
+    without them.
+    """
     varied, batch = trial.varied(velocity, stiffness)
     count = len(next(iter(varied.values())))
     with counting_bar(count, "impacts", progress) as advance:
         return in_batches(partial(trial.run, velocity), varied, batch, advance)
 
 
-def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) -> dict[str, float]:
-    """Median time of one impact in a full batch by each law, over that of the cheapest law."""
-    runs, counts = [], []
+def _costs(
+    laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray
+) -> dict[str, float]:
+    """Median time of one impact in a full batch by each law, over that of the cheapest
+    law.
+    """
+    runs = []
+    counts = []
     for trial in laws.values():
         varied, batch = trial.varied(velocity, stiffness)
         # rows repeated until the batch is full
         full = {name: np.resize(x, (batch, *x.shape[1:])) for name, x in varied.items()}
         runs.append(partial(trial.run, velocity, jax.device_put(full)))
         counts.append(batch)
-    each = [np.median(times) / count for times, count in zip(in_turns(runs, ROUNDS), counts)]
+    each = [
+        np.median(times) / count for times, count in zip(in_turns(runs, ROUNDS), counts)
+    ]
     return {name: float(x / min(each)) for name, x in zip(laws, each)}
 
 
-# -------------------------------------------------------------------------- the evidence
+# -------------------------------------------------------------------------- the
+# evidence
 
 
 def _reclosing_distance(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
-    """Largest `|v+_LZB - v+_Compliant|_M / |v-|_M` of contacts without gaps; with gaps 0.
+    """Largest `|v+_LZB - v+_Compliant|_M / |v-|_M` of contacts without gaps; with gaps
+    0.
 
     The two differ where contacts open and close again.
     """
-    lzb, compliant = outcomes["lzb"], outcomes["compliant"]
+    lzb = outcomes["lzb"]
+    compliant = outcomes["compliant"]
     usable = ~(lzb.failed | compliant.failed)
     if situation.gapped.any() or not usable.any():
         return 0.0
@@ -519,8 +629,8 @@ def _candidate(
 ) -> Candidate:
     """Summary of a law: v+ and its range, errors against the reference, status, cost.
 
-    The law is used at the nominal stiffness, row 0 of `outcomes`; `reference` has a row for each
-    stiffness tried, `random` are those drawn at random.
+    The law is used at the nominal stiffness, row 0 of `outcomes`; `reference` has a row
+    for each stiffness tried, `random` are those drawn at random.
     """
     error = situation.distance(outcomes.velocity[:1] - reference.velocity)
     return Candidate(
@@ -539,9 +649,11 @@ def _candidate(
 def _with_coarsest_rtol(
     candidate: Candidate, situation: Situation, reference: Outcomes, tolerance: float
 ) -> Candidate:
-    """The candidate with the coarsest rtol, a power of ten, that suffices for this tolerance.
+    """The candidate with the coarsest rtol, a power of ten, that suffices for this
+    tolerance.
 
-    It changes v+ by less than `tolerance / SMALL_PART` in the energy norm over that of v-.
+    It changes v+ by less than `tolerance / SMALL_PART` in the energy norm over that of
+    v-.
     """
     rtol = min(10.0 ** math.floor(math.log10(tolerance / SMALL_PART)), COARSEST_RTOL)
     finest = default_rtol("time", situation.velocity.dtype)
@@ -565,16 +677,19 @@ def _with_simplest_laws(
 ) -> tuple[ContactBlock, ...]:
     """The blocks, each with the simplest law that suffices there; None if none does.
 
-    Equation: the law's impulses in the block, those of the reference elsewhere, change v+ by
-    `M^-1 (N dp + H_t dp_t)`, at most `tolerance` in the energy norm over that of v-.
+    Equation: the law's impulses in the block, those of the reference elsewhere, change
+    v+ by `M^-1 (N dp + H_t dp_t)`, at most `tolerance` in the energy norm over that of
+    v-.
     """
-    m, blocks = situation.scene.contacts, []
+    m = situation.scene.contacts
+    blocks = []
     changes = jax.vmap(partial(velocity_change, situation.scene))
     for block in situation.blocks:
         names = candidates if block.approaches else ()
         inside = np.isin(np.arange(m), block.contacts)
         for name in names:
-            out, dp_t = outcomes[name], None
+            out = outcomes[name]
+            dp_t = None
             if t := reference.tangential.shape[1]:
                 of_block = np.repeat(inside, t // m)  # mask (t,) of tangents
                 dp_t = (out.tangential[:1] - reference.tangential) * of_block
@@ -588,20 +703,29 @@ def _with_simplest_laws(
 
 
 def _with_effects(
-    situation: Situation, unknown: tuple[Unknown, ...], reference: Outcomes, tolerance: float
+    situation: Situation,
+    unknown: tuple[Unknown, ...],
+    reference: Outcomes,
+    tolerance: float,
 ) -> tuple[Unknown, ...]:
     """The unknown stiffnesses k with the changes of v+ that each causes by itself.
 
-    Equation: `alone = max |v+(k) - v+(nominal)|` over its range, in the energy norm over that of
-    v-; `needed = tolerance / |d v+ / d ln k|`, the derivative by central differences. Rows of the
-    reference are in the order of `_stiffnesses_to_try`.
+    Equation: `alone = max |v+(k) - v+(nominal)|` over its range, in the energy norm
+    over that of v-; `needed = tolerance / |d v+ / d ln k|`, the derivative by central
+    differences. Rows of the reference are in the order of `_stiffnesses_to_try`.
     """
-    each, places = [], len(ALONE) + 2
+    each = []
+    places = len(ALONE) + 2
     for i, u in enumerate(unknown):
         v = reference.velocity[1 + i * places :][:places]
         *_, up, down = v  # ln k changed by +- NUDGE
-        alone = float(np.nanmax(situation.distance(v[: len(ALONE)] - reference.velocity[0])))
+        alone = float(
+            np.nanmax(situation.distance(v[: len(ALONE)] - reference.velocity[0]))
+        )
         slope = float(situation.distance(up - down)) / (2 * NUDGE)
-        needed = tolerance / slope if slope > 0 else math.inf
+        if slope > 0:
+            needed = tolerance / slope
+        else:
+            needed = math.inf
         each.append(u._replace(alone=alone, needed=needed))
     return tuple(each)

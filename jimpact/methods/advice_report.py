@@ -10,7 +10,14 @@ import numpy as np
 from jimpact.core.law import Declared, Law, parameters_of
 from jimpact.core.scene import Scene
 from jimpact.methods.points import left_out_notes
-from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data, listed
+from jimpact.tools.records import (
+    Column,
+    Table,
+    Tabular,
+    as_data,
+    fields_as_data,
+    listed,
+)
 from jimpact.tools.status import CODE, STATUS
 
 _WIDTH = 80  # characters of the printed lines
@@ -18,16 +25,20 @@ _NAMED = 4  # unknown stiffnesses named one by one; the others are "..."
 _PERCENT_FROM = 1e-4  # smaller errors are printed as 2e-05, not as 0.002 %
 ROUNDING = 1e-12  # errors up to this are printed as "rounding"
 _KNOWN = (  # where nothing was varied
-    "The stiffnesses are taken as known. A range on their ratios tests whether that matters: "
+    "The stiffnesses are taken as known. A range on their ratios tests whether that "
+    "matters: "
     "`stiffness_range=(0.5, 2)`, `jimpact advise --stiffness-range 0.5 2`."
 )
-_POSITIONAL = ("restitution", "stiffness", "exponent")  # parameters of a law as it is printed
+# parameters of a law as it is printed
+_POSITIONAL = ("restitution", "stiffness", "exponent")
 # the same, by name, where they are not the default
 _KEYWORDS = ("friction", "tangential_stiffness", "order", "rtol")
 
 
 class ContactBlock(NamedTuple):
-    """Contacts that feel each other, 0-based; the kinetic angles [deg] between coupled ones."""
+    """Contacts that feel each other, 0-based; the kinetic angles [deg] between coupled
+    ones.
+    """
 
     contacts: tuple[int, ...]
     approaches: bool
@@ -36,11 +47,12 @@ class ContactBlock(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """A stiffness of `contact` that is known within a range only; `k2/k1`: a ratio, `k2`: in SI.
+    """A stiffness of `contact` that is known within a range only; `k2/k1`: a ratio,
+    `k2`: in SI.
 
-    What it does to v+ by itself, in the energy norm over that of v-: `alone`: largest change over
-    its range; `needed`: relative accuracy of k at which it moves v+ by the tolerance (inf: it does
-    not).
+    What it does to v+ by itself, in the energy norm over that of v-: `alone`: largest
+    change over its range; `needed`: relative accuracy of k at which it moves v+ by the
+    tolerance (inf: it does not).
     """
 
     name: str
@@ -54,11 +66,13 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A law, the scene to use it on (contacts taken as closed or not), and how it fares.
+    """A law, the scene to use it on (contacts taken as closed or not), and how it
+    fares.
 
-    `velocity` (n,) at the nominal stiffness; `low`, `high` (n,) over the unknown ratios; `median`
-    and `worst` error of v+ against the reference over them, in the energy norm over that of v-;
-    `cost` per impact in a batch, in units of the cheapest law's (None: not timed).
+    `velocity` (n,) at the nominal stiffness; `low`, `high` (n,) over the unknown
+    ratios; `median` and `worst` error of v+ against the reference over them, in the
+    energy norm over that of v-; `cost` per impact in a batch, in units of the cheapest
+    law's (None: not timed).
     """
 
     law: Law
@@ -73,14 +87,16 @@ class Candidate:
 
     @property
     def usable(self) -> bool:
-        """True if the status is no failure, and v+ does not depend on how contacts are numbered."""
+        """True if the status is no failure, and v+ does not depend on how contacts are
+        numbered.
+        """
         code = CODE[self.status]
         return not STATUS[code].failure and self.status != "order_dependent"
 
 
 @dataclass(frozen=True)
 class Advice(Tabular):
-    """The result of `advise`; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
+    """The result of `advise`, for `ji.impact(advice.law, advice.scene, v)`.
 
     Attributes:
         name: of the simplest law; `reason` says what decided.
@@ -94,11 +110,12 @@ class Advice(Tabular):
         stiffness: nominal ones (m,).
         unknown: the stiffnesses that are not known and what they do.
         rows: how many stiffnesses were tried.
-        gap_ratio: gaps that can close while other contacts are loaded, in units of delta_c
-            (`ji.theory.gap_scale`), or None.
-        far: open contacts (from 0) that cannot close during the impact and take no part.
-        reclosing: largest difference between LZB and Compliant on contacts without gaps: LZB lets
-            opened contacts close again at once.
+        gap_ratio: gaps that can close while other contacts are loaded, in units of
+            delta_c (`ji.theory.gap_scale`), or None.
+        far: open contacts (from 0) that cannot close during the impact and take no
+            part.
+        reclosing: largest difference between LZB and Compliant on contacts without
+            gaps: LZB lets opened contacts close again at once.
         left_out: why a law is missing: it raised.
     """
 
@@ -138,7 +155,8 @@ class Advice(Tabular):
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it; contacts counted from 1."""
         laws = {
-            name: fields_as_data(c, "law", "scene") | {"law": as_code(c.law), "usable": c.usable}
+            name: fields_as_data(c, "law", "scene")
+            | {"law": as_code(c.law), "usable": c.usable}
             for name, c in self.candidates.items()
         }
         return fields_as_data(self, "name", "candidates") | {
@@ -146,7 +164,9 @@ class Advice(Tabular):
             "law": as_code(self.law),
             "reason": self.reason,
             "laws": laws,
-            "blocks": [as_data(b) | {"contacts": _from_one(b.contacts)} for b in self.blocks],
+            "blocks": [
+                as_data(b) | {"contacts": _from_one(b.contacts)} for b in self.blocks
+            ],
             "unknown": [as_data(u) | {"contact": u.contact + 1} for u in self.unknown],
             "far": _from_one(self.far),
         }
@@ -154,7 +174,10 @@ class Advice(Tabular):
     @property
     def table(self) -> Table:
         """The advice, its reason, and a row for each law: half a page."""
-        verdict = "within" if self.within else "NOT within"
+        if self.within:
+            verdict = "within"
+        else:
+            verdict = "NOT within"
         head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
         for line in (self.reason, *_block_lines(self)):
             head += textwrap.wrap(line, _WIDTH)
@@ -164,7 +187,10 @@ class Advice(Tabular):
             Column("law", lambda name: ("*" if name == self.name else " ") + name),
             *(Column(name, share) for name in ("median", "worst")),
             Column("cost", ".3g", "relative cost"),
-            *(Column(f"v_{i + 1}_plus", ".4f", f"v{i + 1}+") for i in range(len(self.velocity))),
+            *(
+                Column(f"v_{i + 1}_plus", ".4f", f"v{i + 1}+")
+                for i in range(len(self.velocity))
+            ),
             Column("status"),
         )
         rows = [
@@ -172,11 +198,14 @@ class Advice(Tabular):
             for name, c in self.candidates.items()
         ]
         footnote = (
-            f"Error of v+ against {self.reference}: sqrt(dv^T M dv) over sqrt(v-^T M v-), dv the "
+            f"Error of v+ against {self.reference}: sqrt(dv^T M dv) over sqrt(v-^T M "
+            f"v-), dv the "
             f"difference of v+; stiffnesses tried: {self.rows}."
         )
         notes = ["", *textwrap.wrap(footnote, _WIDTH)]
-        if not self.unknown and any(b.approaches and len(b.contacts) > 1 for b in self.blocks):
+        if not self.unknown and any(
+            b.approaches and len(b.contacts) > 1 for b in self.blocks
+        ):
             notes += textwrap.wrap(_KNOWN, _WIDTH)
         notes += left_out_notes(self.left_out)
         return Table(columns, rows, [*head, ""], notes)
@@ -188,15 +217,21 @@ def _from_one(contacts: tuple[int, ...]) -> list[int]:
 
 
 def _unknown_table(unknown: tuple[Unknown, ...]) -> Table:
-    """Table of unknown stiffnesses, the strongest first: range, change of v+, accuracy needed."""
+    """Table of unknown stiffnesses, the strongest first: range, change of v+, accuracy
+    needed.
+    """
     columns = (
         Column("unknown"),
         Column("range"),
         Column("alone", share, "moves v+ by"),
-        Column("needed", lambda x: f"{100 * x:.2g} %" if x < 1 else "", "know it within"),
+        Column(
+            "needed", lambda x: f"{100 * x:.2g} %" if x < 1 else "", "know it within"
+        ),
     )
     strongest = sorted(unknown, key=lambda u: -u.alone)[:_NAMED]
-    rows = [[u.name, f"{u.low:.3g} to {u.high:.3g}", u.alone, u.needed] for u in strongest]
+    rows = [
+        [u.name, f"{u.low:.3g} to {u.high:.3g}", u.alone, u.needed] for u in strongest
+    ]
     return Table(columns, rows)
 
 
@@ -213,7 +248,9 @@ def share(x: float) -> str:
         return "rounding"
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
     up = math.ceil(x / unit * (1 - ROUNDING)) * unit
-    return f"{100 * up:.3g} %" if x >= _PERCENT_FROM else f"{up:.2g}"
+    if x >= _PERCENT_FROM:
+        return f"{100 * up:.3g} %"
+    return f"{up:.2g}"
 
 
 def as_code(law: Declared) -> str:
@@ -233,7 +270,9 @@ def as_code(law: Declared) -> str:
 
 
 def _in_code(value: Any) -> str:
-    """Python expression of a value: a string, one number, or a list of unequal numbers."""
+    """Python expression of a value: a string, one number, or a list of unequal
+    numbers.
+    """
     if isinstance(value, str):
         return repr(value)
     array = np.asarray(value)
@@ -243,39 +282,53 @@ def _in_code(value: Any) -> str:
 
 
 def _block_lines(advice: Advice) -> list[str]:
-    """Lines of the report: contacts of each block, their kinetic angles, the law that suffices.
+    """Lines of the report: contacts of each block, their kinetic angles, the law that
+    suffices.
 
     Decoupled contacts with the same law share a line.
     """
     groups: dict[tuple[str, Any], list[int]] = {}
     for block in advice.blocks:
         law = f"{block.law or 'no law'} suffices"
-        what, coupled = f"decoupled: {law}", None
+        what = f"decoupled: {law}"
+        coupled = None
         if not block.approaches:
             what = "without an approach"
         elif block.angles is not None:
             coupled = block.contacts
             low, high = (f"{angle:.4g}" for angle in block.angles)
-            angles = f"angle {low}" if low == high else f"angles {low} to {high}"
+            if low == high:
+                angles = f"angle {low}"
+            else:
+                angles = f"angles {low} to {high}"
             what = f"coupled (kinetic {angles} degrees): {law}"
         groups.setdefault((what, coupled), []).extend(block.contacts)
     if advice.far:
         groups["too far open to close during the impact", None] = list(advice.far)
     return [
-        f"contact{'s' * (len(contacts) > 1)} {', '.join(str(j + 1) for j in contacts)} {what}"
+        (
+            f"contact{'s' * (len(contacts) > 1)} "
+            f"{', '.join(str(j + 1) for j in contacts)} "
+            f"{what}"
+        )
         for (what, _), contacts in groups.items()
     ]
 
 
 def _cause(advice: Advice) -> str:
-    """Phrase: the cause of the advice (no approach, contacts that act alone, gaps, stiffnesses)."""
+    """Phrase: the cause of the advice (no approach, contacts that act alone, gaps,
+    stiffnesses).
+    """
     at_work = [block for block in advice.blocks if block.approaches]
     if not at_work:
         slowest = float(advice.gap_velocity.min())
         return f"no approach: nothing happens (smallest gap velocity {slowest:.3g} m/s)"
     if all(len(block.contacts) == 1 for block in at_work):
-        alone, several = "single contact", "contacts decoupled: kinetic angle 90 degrees"
-        return alone if len(at_work) == 1 else several
+        alone = "single contact"
+        several = "contacts decoupled: kinetic angle 90 degrees"
+        if len(at_work) == 1:
+            return alone
+        return several
     stiffnesses = _stiffnesses(advice, at_work)
     if not advice.within:
         strongest = max(advice.unknown, key=lambda u: u.alone)
@@ -285,34 +338,59 @@ def _cause(advice: Advice) -> str:
         return f"gaps of {gaps} delta_c, see ji.theory.gap_scale"
     if advice.reference == "compliant":
         apart = share(advice.reclosing)
-        return f"contacts open and close again, where lzb and compliant are up to {apart} apart"
-    if advice.name == "newton" and not np.any(parameters_of(advice.law)["restitution"].value):
+        return (
+            f"contacts open and close again, where lzb and compliant are up to "
+            f"{apart} apart"
+        )
+    if advice.name == "newton" and not np.any(
+        parameters_of(advice.law)["restitution"].value
+    ):
         return "plastic contacts (restitution 0) that stay together"
     if advice.name == advice.reference and not advice.unknown:
         return (
-            f"{stiffnesses}, taken as known: {advice.name} is the reference itself, and compliant, "
-            f"with springs in the place of its energies, is {share(advice.reclosing)} apart"
+            f"{stiffnesses}, taken as known: {advice.name} is the reference itself, "
+            f"and compliant, "
+            f"with springs in the place of its energies, is {share(advice.reclosing)} "
+            f"apart"
         )
-    return f"{stiffnesses}: {advice.name} is within {share(advice.candidates[advice.name].worst)}"
+    return (
+        f"{stiffnesses}: {advice.name} is within "
+        f"{share(advice.candidates[advice.name].worst)}"
+    )
 
 
 def _stiffnesses(advice: Advice, at_work: list[ContactBlock]) -> str:
-    """Phrase: unknown stiffnesses with their ranges, else known ratios within coupled contacts."""
+    """Phrase: unknown stiffnesses with their ranges, else known ratios within coupled
+    contacts.
+    """
     words = [f"{u.name} in [{u.low:.3g}, {u.high:.3g}]" for u in advice.unknown]
     if not words:
-        k, pairs = advice.stiffness, [(b.contacts[0], j) for b in at_work for j in b.contacts[1:]]
+        k = advice.stiffness
+        pairs = [(b.contacts[0], j) for b in at_work for j in b.contacts[1:]]
         words = [f"k{j + 1}/k{i + 1} = {k[j] / k[i]:.3g}" for i, j in pairs]
-    kind = "stiffness ratio" if "/" in words[0] else "stiffness"
+    if "/" in words[0]:
+        kind = "stiffness ratio"
+    else:
+        kind = "stiffness"
     return f"{kind} {listed(words, _NAMED)}"
 
 
 def _closest_simpler(advice: Advice) -> str:
-    """Phrase: error of the best of the simpler laws, or its failure; '' if there is none."""
+    """Phrase: error of the best of the simpler laws, or its failure; '' if there is
+    none.
+    """
     names = list(advice.candidates)
-    simpler = {name: advice.candidates[name] for name in names[: names.index(advice.name)]}
+    simpler = {
+        name: advice.candidates[name] for name in names[: names.index(advice.name)]
+    }
     if not simpler or not any(block.approaches for block in advice.blocks):
         return ""
-    best = min(simpler, key=lambda name: (not simpler[name].usable, simpler[name].worst))
+    best = min(
+        simpler, key=lambda name: (not simpler[name].usable, simpler[name].worst)
+    )
     if not simpler[best].usable:
         return f"{best} fails: {simpler[best].status}"
-    return f"of the simpler laws {best} comes closest and is off by {share(simpler[best].worst)}"
+    return (
+        f"of the simpler laws {best} comes closest and is off by "
+        f"{share(simpler[best].worst)}"
+    )

@@ -41,11 +41,16 @@ from jimpact.tools.status import STATUS
 QUANTITIES = ("velocity", "impulse", "energy", "duration", "gradient")
 ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 
-SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
-SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be right by chance
-HOST_BATCH = 4  # impacts that a method without vmap does, in a loop, for its time in a batch
+# stiffnesses of a batch lie within this factor, half of it to either side
+SPREAD = 10.0
+# impacts of the batch on which errors are measured: one alone may be right by chance
+SAMPLE = 16
+# impacts that a method without vmap does, in a loop, for its time in a batch
+HOST_BATCH = 4
 HOST = "runs on the host: finite differences only"
-FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the second solution
+# rtol of the reference, and of the second solution
+FINEST = 1e-14
+SECOND = 1e-12
 
 
 class Timing(NamedTuple):
@@ -60,9 +65,10 @@ class Timing(NamedTuple):
 class Point:
     """A contender at one of its settings, or a law (`setting` None).
 
-    `error[quantity]` is relative, the largest over the sample (of a law: its model error); NaN
-    where there is none. `evaluations`: mean number of field evaluations an impact, NaN where there
-    are none or they are not counted. `gradient` is None where there is none. `status`: the gravest.
+    `error[quantity]` is relative, the largest over the sample (of a law: its model
+    error); NaN where there is none. `evaluations`: mean number of field evaluations an
+    impact, NaN where there are none or they are not counted. `gradient` is None where
+    there is none. `status`: the gravest.
     """
 
     label: str
@@ -88,7 +94,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class WorkPrecision(Tabular):
-    """Error against time and work; `print` gives a table, `ji.plot.work_precision` a picture.
+    """Error against time and work; `print` gives a table.
 
     Attributes:
         velocity: v- (n,) [m/s].
@@ -122,7 +128,9 @@ class WorkPrecision(Tabular):
 
     @property
     def table(self) -> Table:
-        """Table: errors and times, a row for each point; notes say how they were measured."""
+        """Table: errors and times, a row for each point; notes say how they were
+        measured.
+        """
         heads = ("v+", "impulse", "energy", "time", "gradient")
         columns = (
             Column("method"),
@@ -138,23 +146,41 @@ class WorkPrecision(Tabular):
             Column("status"),
         )
         rows = []
-        differentiated = any(x.gradient for points in self.points.values() for x in points)
+        differentiated = any(
+            x.gradient for points in self.points.values() for x in points
+        )
         for name, points in self.points.items():
-            compiled = sum(self.compile_time.get(name, {}).values()) or None  # said once
+            # said once
+            compiled = sum(self.compile_time.get(name, {}).values()) or None
             for x in points:
                 errors = [x.error.get(q, np.nan) for q in QUANTITIES]
                 times = [x.single.median, *x.batched, x.gradient and x.gradient.median]
-                rows.append([name, x.setting, *errors, x.evaluations, *times, compiled, x.status])
+                rows.append(
+                    [
+                        name,
+                        x.setting,
+                        *errors,
+                        x.evaluations,
+                        *times,
+                        compiled,
+                        x.status,
+                    ]
+                )
                 compiled = None
         uncertain = ", ".join(
-            f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items() if not np.isnan(v)
+            f"{k} {v:.0e}"
+            for k, v in self.reference.uncertainty.items()
+            if not np.isnan(v)
         )
         notes = [
             f"Reference: {self.reference.how}; uncertain by {uncertain}.",
-            f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
+            f"Errors: relative, the largest of {self.sample} impacts with stiffness "
+            f"spread over a "
             f"factor {self.spread:g}; of a law its model error.",
-            f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch of "
-            f"{self.batch} (from, to: quartiles){', with J: with the Jacobian' * differentiated}.",
+            f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch "
+            f"of "
+            f"{self.batch} (from, to: "
+            f"quartiles){', with J: with the Jacobian' * differentiated}.",
         ]
         notes += left_out_notes(self.left_out)
         notes += left_out_notes(self.without_gradient, "has no gradient")
@@ -177,24 +203,29 @@ def work_precision(
     durations: bool = True,
     progress: float | None = None,
 ) -> WorkPrecision:
-    """Error against time and against field evaluations of many ways to integrate one impact.
+    """Error against time and against field evaluations of ways to integrate an impact.
 
-    Errors are relative, the largest over a sample of impacts with the stiffness of every contact
-    spread at random over a factor of 10, the impact itself among them: `max |dv| / max |v-|`,
-    `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration, and the Jacobian
-    `(d v+ / d ln k, d v+ / d e)`, with friction also `d v+ / d mu`, by forward mode, its error over
-    `max |v-|`. Times are per impact, one alone and in a batch, taken in turns; compile times apart.
+    Errors are relative, the largest over a sample of impacts with the stiffness of
+    every contact spread at random over a factor of 10, the impact itself among them:
+    `max |dv| / max |v-|`, `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration, and the
+    Jacobian
+    `(d v+ / d ln k, d v+ / d e)`, with friction also `d v+ / d mu`, by forward mode,
+    its error over `max |v-|`. Times are per impact, one alone and in a batch, taken in
+    turns; compile times apart.
 
     Args:
-        law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does. With
-            `friction` (scenes with tangents, planar or in space) methods without it are left out.
+        law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does.
+            With `friction` (scenes with tangents, planar or in space) methods without
+            it are left out.
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s], at least one contact approaching.
-        methods: names in `jimpact.methods.contenders.CONTENDERS`, or contenders of your own; None:
-            all that support the impact. One that raises is left out, and the table says why.
+        methods: names in `jimpact.methods.contenders.CONTENDERS`, or contenders of your
+            own; None: all that support the impact. One that raises is left out, and the
+            table says why.
         settings: settings by method, in place of its default ones.
-        laws: algebraic laws by name, points with their *model* error against LZB on this impact;
-            None: Newton, Moreau, Poisson and Binary with the law's restitution and friction.
+        laws: algebraic laws by name, points with their *model* error against LZB on
+            this impact; None: Newton, Moreau, Poisson and Binary with the law's
+            restitution and friction.
         reference: method that errors are measured from, at rtol 1e-14; None: the
             event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
@@ -208,9 +239,9 @@ def work_precision(
         `WorkPrecision`; `print` gives a table, `ji.plot.work_precision` the chart.
 
     Raises:
-        ValueError: a method that is unknown or does not support the law, nothing approaches,
-            single precision, bad sizes. TypeError: a law that is not LZB, or arguments in another
-            order.
+        ValueError: a method that is unknown or does not support the law, nothing
+            approaches, single precision, bad sizes. TypeError: a law that is not LZB,
+            or arguments in another order.
 
     >>> import jimpact as ji
     >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
@@ -223,7 +254,8 @@ def work_precision(
     repeats = as_whole("repeats", repeats, 1)
     case = _case(scene, velocity, law, as_whole("batch", batch, 1))
     chosen, left_out = _chosen(methods, settings or {}, case)
-    exact, second = _reference(reference, case), CONTENDERS["time"]
+    exact = _reference(reference, case)
+    second = CONTENDERS["time"]
     if laws is None:
         laws, _ = registered_laws(shared_parameters(law), ALGEBRAIC)
     check_kind("laws", laws, Mapping)
@@ -231,18 +263,32 @@ def work_precision(
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
     _check_names(laws, different)
-    programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
+    programs = {
+        n: _method_programs(m, case, gradients, durations) for n, m in different.items()
+    }
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
-    ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
-    truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
+    ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(
+        laws, (None,)
+    )
+    truth = programs[exact.name].at(FINEST)
+    other_truth = programs[second.name].at(SECOND)
     with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
         climbed = {
-            name: partial(_outcomes_over_ladder, programs[name], name, advance) for name in ladders
+            name: partial(_outcomes_over_ladder, programs[name], name, advance)
+            for name in ladders
         }
         solutions, raised = at_points(climbed, ladders)
-    rows = [(n, setting, s) for n, row in solutions.items() for setting, s in zip(ladders[n], row)]
-    times = _times([(programs[name], setting) for name, setting, _ in rows], repeats, progress)
-    labels = {m.name: m.label or m.name for m in chosen} | {name: f"law: {name}" for name in laws}
+    rows = [
+        (n, setting, s)
+        for n, row in solutions.items()
+        for setting, s in zip(ladders[n], row)
+    ]
+    times = _times(
+        [(programs[name], setting) for name, setting, _ in rows], repeats, progress
+    )
+    labels = {m.name: m.label or m.name for m in chosen} | {
+        name: f"law: {name}" for name in laws
+    }
     points: dict[str, list[Point]] = {name: [] for name in solutions}
     for (name, setting, solution), timings in zip(rows, times):
         off = _errors(case, solution, truth)
@@ -268,7 +314,9 @@ def work_precision(
 
 
 def _check_names(laws: Mapping[str, Law], methods: Mapping[str, Contender]) -> None:
-    """Raise a ValueError where a law has the name of a method: both have a row in the chart."""
+    """Raise a ValueError where a law has the name of a method: both have a row in the
+    chart.
+    """
     for name in laws:
         if name in methods:
             raise ValueError(
@@ -277,12 +325,18 @@ def _check_names(laws: Mapping[str, Law], methods: Mapping[str, Contender]) -> N
 
 
 def shared_parameters(law: LZB) -> dict[str, Any]:
-    """Parameters that algebraic laws share with LZB: `restitution`, and `friction` if any."""
-    friction = {} if law.friction is None else {"friction": law.friction}
+    """Parameters that algebraic laws share with LZB: `restitution`, and `friction` if
+    any.
+    """
+    if law.friction is None:
+        friction = {}
+    else:
+        friction = {"friction": law.friction}
     return {"restitution": law.restitution} | friction
 
 
-# -------------------------------------------------------------- the impact, and the contenders
+# -------------------------------------------------------------- the impact, and the
+# contenders
 
 
 class Case(NamedTuple):
@@ -296,14 +350,19 @@ class Case(NamedTuple):
 
 
 def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
-    """The impact in double precision, one parameter per contact, with a batch around it."""
+    """The impact in double precision, one parameter per contact, with a batch around
+    it.
+    """
     v = as_velocity(scene, velocity, finite=True)
     if not isinstance(law, LZB):
-        raise TypeError(f"Argument `law` must be an LZB law, but is {type(law).__name__}.")
+        raise TypeError(
+            f"Argument `law` must be an LZB law, but is {type(law).__name__}."
+        )
     law, scene, v = in_common_dtype(law, scene, v)
     if v.dtype != jnp.float64:
         raise ValueError(
-            f"Argument `velocity` must be in double precision, but has dtype {v.dtype}: "
+            f"Argument `velocity` must be in double precision, but has dtype "
+            f"{v.dtype}: "
             "enable jax_enable_x64."
         )
     check_law(law, scene, v.dtype)
@@ -324,9 +383,11 @@ def _chosen(
     settings: Mapping[str, Sequence[float]],
     case: Case,
 ) -> tuple[list[Contender], dict[str, str]]:
-    """Contenders with the ladders of settings to run, and reasons why others are left out, by name.
+    """Contenders with the ladders of settings to run, and reasons why others are left
+    out, by name.
 
-    `methods` None: all that support the law of the case; `settings` replaces ladders by name.
+    `methods` None: all that support the law of the case; `settings` replaces ladders by
+    name.
     """
     left_out: dict[str, str] = {}
     if methods is None:
@@ -343,7 +404,9 @@ def _chosen(
     return [m._replace(ladder=tuple(x)) for m, x in zip(chosen, ladders)], left_out
 
 
-def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -> list[Contender]:
+def _supporting(
+    argument: str, methods: Sequence[str | Contender], case: Case
+) -> list[Contender]:
     """Contenders by name, checked that they support the law of the case."""
     chosen = contenders_of(argument, methods, CONTENDERS)
     for contender in chosen:
@@ -364,15 +427,17 @@ def _reference(name: str | None, case: Case) -> Contender:
     return contender
 
 
-# ------------------------------------------------------------------------------- programs
+# -------------------------------------------------------------------------------
+# programs
 
 
 @dataclass(frozen=True)
 class Programs:
     """The programs of a contender, functions of its setting, or of a law.
 
-    `single` solves one impact, `batched` a number `batch` of them, `sampled` those on which errors
-    are measured; `compile_time` [s] by program, filled in by the first calls.
+    `single` solves one impact, `batched` a number `batch` of them, `sampled` those on
+    which errors are measured; `compile_time` [s] by program, filled in by the first
+    calls.
     """
 
     single: Callable[[Any], Any]
@@ -383,20 +448,30 @@ class Programs:
     compile_time: dict[str, float] = field(default_factory=dict)
 
     def at(self, setting: float | None) -> Outcomes:
-        """Outcomes (S,) of the sampled impacts at a setting, with Jacobians if known, in NumPy.
+        """Outcomes (S,) of the sampled impacts at a setting, with Jacobians if known,
+        in NumPy.
 
         Evaluations are NaN where they are not counted.
         """
         outcomes = jax.tree.map(np.asarray, self.sampled(setting))
-        evaluations = np.where(outcomes.evaluations == UNCOUNTED, np.nan, outcomes.evaluations)
-        jacobian = None if self.gradient is None else np.asarray(self.gradient(setting))
+        evaluations = np.where(
+            outcomes.evaluations == UNCOUNTED, np.nan, outcomes.evaluations
+        )
+        if self.gradient is None:
+            jacobian = None
+        else:
+            jacobian = np.asarray(self.gradient(setting))
         return outcomes._replace(evaluations=evaluations, jacobian=jacobian)
 
 
 def _outcomes_over_ladder(
-    programs: Programs, name: str, advance: Callable[[int], None], ladders: Mapping[str, Any]
+    programs: Programs,
+    name: str,
+    advance: Callable[[int], None],
+    ladders: Mapping[str, Any],
 ) -> list[Outcomes]:
-    """Outcomes of the sampled impacts at every setting of the ladder of contender `name`.
+    """Outcomes of the sampled impacts at every setting of the ladder of contender
+    `name`.
 
     `advance` is called with the number of settings, even if the contender raises.
     """
@@ -409,10 +484,13 @@ def _outcomes_over_ladder(
 def _method_programs(
     contender: Contender, case: Case, gradients: bool, durations: bool
 ) -> Programs:
-    """Programs of a contender over the stiffnesses (batch, m) of the case, jitted and vmapped."""
+    """Programs of a contender over the stiffnesses (batch, m) of the case, jitted and
+    vmapped.
+    """
     if not contender.jax:
         return _host_programs(contender, case)
-    names, apart = tuple(shared_parameters(case.law)), contender.duration_apart
+    names = tuple(shared_parameters(case.law))
+    apart = contender.duration_apart
 
     def solve(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
         """Outcome of the case's impact with stiffness k (m,)."""
@@ -420,47 +498,70 @@ def _method_programs(
         return solved(contender, law, case.scene, case.velocity, setting)[1]
 
     def timed(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
-        """Outcome with a duration of NaN where it costs a run of its own or is not wanted."""
+        """Outcome with a duration of NaN where it costs a run of its own or is not
+        wanted.
+        """
         solution = solve(k, case, setting)
-        return solution._replace(duration=jnp.nan) if apart or not durations else solution
+        if apart or not durations:
+            return solution._replace(duration=jnp.nan)
+        return solution
 
     def jacobian(k: jax.Array, case: Case, setting: jax.Array) -> Any:
-        """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3 m)."""
+        """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3
+        m).
+        """
 
         def velocity(at: dict[str, jax.Array]) -> jax.Array:
-            """v+ (n,) [m/s] at the parameters `at` (m,) by name; 'ln k' is a change of ln k."""
+            """v+ (n,) [m/s] at the parameters `at` (m,) by name; 'ln k' is a change of
+            ln k.
+            """
             law = case.law
             for name in names:
                 law = with_entries(law, (name,), at[name])
             factor = jnp.exp(at["ln k"])
             return timed(k * factor, case._replace(law=law), setting).velocity
 
-        at = {"ln k": jnp.zeros_like(k)} | {name: getattr(case.law, name) for name in names}
+        at = {"ln k": jnp.zeros_like(k)} | {
+            name: getattr(case.law, name) for name in names
+        }
         parts = jax.jacfwd(velocity)(at)
         return jnp.concatenate([parts[name] for name in at], axis=-1)
 
-    k, compile_time = case.stiffness, dict[str, float]()
+    k = case.stiffness
+    compile_time = dict[str, float]()
 
-    def batch(name: str, function: Callable[..., Any], rows: int) -> Callable[[Any], Any]:
-        """Program of a setting: the function at each of the first `rows` stiffnesses."""
+    def batch(
+        name: str, function: Callable[..., Any], rows: int
+    ) -> Callable[[Any], Any]:
+        """Program of a setting: the function at each of the first `rows`
+        stiffnesses.
+        """
         each = jax.vmap(function, in_axes=(0, None, None))
         return _compiled(compile_time, name, each, k[:rows], case)
 
     batched = batch("batched", timed, len(k))
     # errors need the duration, times do not: two programs if it takes a run of its own
-    complete = batch("errors", solve, case.sample) if durations and apart else batched
+    if durations and apart:
+        complete = batch("errors", solve, case.sample)
+    else:
+        complete = batched
     return Programs(
         single=_compiled(compile_time, "single", timed, k[0], case),
         batched=batched,
         batch=len(k),
-        sampled=lambda setting: jax.tree.map(lambda a: a[: case.sample], complete(setting)),
+        sampled=lambda setting: jax.tree.map(
+            lambda a: a[: case.sample], complete(setting)
+        ),
         gradient=batch("gradient", jacobian, case.sample) if gradients else None,
         compile_time=compile_time,
     )
 
 
 def _compiled(
-    compile_time: dict[str, float], name: str, function: Callable[..., Any], *arguments: Any
+    compile_time: dict[str, float],
+    name: str,
+    function: Callable[..., Any],
+    *arguments: Any,
 ) -> Callable[[Any], Any]:
     """`setting -> function(*arguments, setting)`, compiled at its first call.
 
@@ -481,33 +582,47 @@ def _compiled(
 
 
 def _host_programs(contender: Contender, case: Case) -> Programs:
-    """Programs of a contender that JAX cannot trace: loops over stiffnesses on the host."""
+    """Programs of a contender that JAX cannot trace: loops over stiffnesses on the
+    host.
+    """
     laws = [with_entries(case.law, ("stiffness",), k) for k in case.stiffness[:SAMPLE]]
     rows = min(HOST_BATCH, len(laws))
 
     def sampled(setting: Any) -> Outcomes:
         """Outcomes of the sampled impacts, one after the other."""
-        each = [solved(contender, law, case.scene, case.velocity, setting)[1] for law in laws]
+        each = [
+            solved(contender, law, case.scene, case.velocity, setting)[1]
+            for law in laws
+        ]
         return jax.tree.map(lambda *a: jnp.stack(a), *each)
 
     def alone(setting: Any, count: int = 1) -> list[Any]:
-        """Solutions of the first `count` impacts, without checks: for the time of the solver."""
-        return [contender.solve(law, case.scene, case.velocity, setting) for law in laws[:count]]
+        """Solutions of the first `count` impacts, without checks: for the time of the
+        solver.
+        """
+        return [
+            contender.solve(law, case.scene, case.velocity, setting)
+            for law in laws[:count]
+        ]
 
     batched = partial(alone, count=rows)
     return Programs(single=alone, batched=batched, batch=rows, sampled=sampled)
 
 
 def _law_programs(law: Law, case: Case) -> Programs:
-    """Programs of an algebraic law, which has no setting; its sample is the impact itself."""
-    law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
+    """Programs of an algebraic law, which has no setting; its sample is the impact
+    itself.
+    """
+    law = in_common_dtype(law, case.velocity)[0]
+    batch = len(case.stiffness)
     compile_time: dict[str, float] = {}
 
     def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Outcomes:
         """Outcome of one impact at v (n,); `setting` is not used."""
         return Outcomes.of(impact(law, scene, v))
 
-    many, v = jax.vmap(run, in_axes=(0, None, None, None)), case.velocity
+    many = jax.vmap(run, in_axes=(0, None, None, None))
+    v = case.velocity
     one = _compiled(compile_time, "single", run, v, law, case.scene)
     velocities = jnp.tile(v, (batch, 1))
     return Programs(
@@ -519,17 +634,23 @@ def _law_programs(law: Law, case: Case) -> Programs:
     )
 
 
-# ------------------------------------------------------------------------- errors and times
+# ------------------------------------------------------------------------- errors and
+# times
 
 
 def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
-    """Relative errors by quantity, the largest over the sampled impacts; NaN: not computed.
+    """Relative errors by quantity, the largest over the sampled impacts; NaN: not
+    computed.
 
-    Equation: `max |dv| / max |v-|`, `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration over the
-    longest, Jacobian over `max |v-|`. At rest the largest |v+| and |T+ - T-| take their places.
+    Equation: `max |dv| / max |v-|`, `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration
+    over the longest, Jacobian over `max |v-|`. At rest the largest |v+| and |T+ - T-|
+    take their places.
     """
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(truth.velocity).max()
-    before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(truth.energy_change).max()
+    before = (
+        float(kinetic_energy(case.scene, case.velocity))
+        or np.abs(truth.energy_change).max()
+    )
     compared = {  # value, exact value, scale
         "velocity": (tried.velocity, truth.velocity, fastest),
         "impulse": (tried.impulse, truth.impulse, np.abs(truth.impulse).max()),
@@ -552,15 +673,20 @@ def _point(
     tried: Outcomes,
     timings: Sequence[Timing],
 ) -> Point:
-    """Point of the chart: its errors, the gravest status, mean evaluations, times per impact."""
+    """Point of the chart: its errors, the gravest status, mean evaluations, times per
+    impact.
+    """
     status = STATUS[int(np.max(tried.status))].name
-    return Point(label, setting, error, float(np.mean(tried.evaluations)), status, *timings)
+    return Point(
+        label, setting, error, float(np.mean(tried.evaluations)), status, *timings
+    )
 
 
 def _times(
     rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
-    """Times per impact of each row (programs, setting): alone, in a batch, with gradient if any.
+    """Times per impact of each row (programs, setting): alone, in a batch, with
+    gradient if any.
 
     All are measured in turns, `repeats` times.
     """
@@ -575,7 +701,9 @@ def _times(
         if run is not None
     ]
     with counting_bar(len(tasks) * repeats, "timings", progress) as advance:
-        times_of_tasks = in_turns([run for *_, run in tasks], repeats, lambda: advance(1))
+        times_of_tasks = in_turns(
+            [run for *_, run in tasks], repeats, lambda: advance(1)
+        )
     times: list[list[Timing]] = [[] for _ in rows]
     for (row, impacts, _), seconds in zip(tasks, times_of_tasks):
         quartiles = np.quantile(seconds / impacts, (0.5, 0.25, 0.75))

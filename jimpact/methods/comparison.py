@@ -17,16 +17,26 @@ from jimpact.core.scene import Scene, as_velocity, dense_mass
 from jimpact.methods.points import at_points, in_turns, left_out_notes, seconds
 from jimpact.theory.dispersion import dispersion_index, energy_ratio
 from jimpact.tools.checks import check_kind
-from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
+from jimpact.tools.records import (
+    Column,
+    Table,
+    Tabular,
+    as_data,
+    fields_as_data,
+    microseconds,
+)
 from jimpact.tools.status import STATUS
 
 _REPEATS = 20  # of the timing, whose median is reported
-AS_CLOSE = 1.01  # distances from the measured velocities up to this ratio count as equal
+# distances from the measured velocities up to this ratio count as equal
+AS_CLOSE = 1.01
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One law's row of a comparison; `time` [s] of one impact, compiled, `compile_time` [s]."""
+    """One law's row of a comparison; `time` [s] of one impact, compiled, `compile_time`
+    [s].
+    """
 
     law: Law
     outcome: Impact
@@ -43,7 +53,9 @@ class Entry:
 
     @property
     def verdict(self) -> str:
-        """'ok', or the conditions that the audit finds violated, and a status that is not ok."""
+        """'ok', or the conditions that the audit finds violated, and a status that is
+        not ok.
+        """
         broken = [f"{name} violated" for name in self.audit.broken]
         if self.status != "ok":
             broken.append(self.status)
@@ -51,9 +63,13 @@ class Entry:
 
     def to_dict(self) -> dict[str, Any]:
         """The row, as a JSON file can hold it."""
-        out, checked = self.outcome, {"status": self.status, "consistent": self.audit.consistent}
+        out = self.outcome
+        checked = {"status": self.status, "consistent": self.audit.consistent}
         rest = fields_as_data(self, "law", "outcome", "audit")
-        return as_data({"velocity": out.velocity, "impulse": out.impulse, **checked}) | rest
+        return (
+            as_data({"velocity": out.velocity, "impulse": out.impulse, **checked})
+            | rest
+        )
 
 
 @dataclass(frozen=True)
@@ -78,10 +94,11 @@ class Comparison(Tabular):
 
     @property
     def distances(self) -> dict[str, float]:
-        """Root mean square difference [m/s] of each law's v+ from the measured one, if any.
+        """Root mean square difference [m/s] of each law's v+ from the measured one, if
+        any.
 
-        Equation: `sqrt(mean_i (M_ii / max M_ii) (v_i+ - measured_i)^2)`, weights of 1 in a chain:
-        rotations in rad/s count as m/s with as much energy.
+        Equation: `sqrt(mean_i (M_ii / max M_ii) (v_i+ - measured_i)^2)`, weights of 1
+        in a chain: rotations in rad/s count as m/s with as much energy.
         """
         if self.measured is None:
             return {}
@@ -91,15 +108,21 @@ class Comparison(Tabular):
             weight = np.sqrt(inertia / inertia.max())
         after = {name: entry.outcome.velocity for name, entry in self.entries.items()}
         return {
-            name: float(np.sqrt(np.nanmean((weight * (np.asarray(v) - self.measured)) ** 2)))
+            name: float(
+                np.sqrt(np.nanmean((weight * (np.asarray(v) - self.measured)) ** 2))
+            )
             for name, v in after.items()
         }
 
     @property
     def closest(self) -> tuple[str, ...]:
-        """The law closest to the measured velocities, and those that are as close to 1 %."""
+        """The law closest to the measured velocities, and those that are as close to 1
+        %.
+        """
         least = min(self.distances.values(), default=math.nan)
-        return tuple(name for name, x in self.distances.items() if x <= AS_CLOSE * least)
+        return tuple(
+            name for name, x in self.distances.items() if x <= AS_CLOSE * least
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The laws' rows, as a JSON file can hold them."""
@@ -108,10 +131,17 @@ class Comparison(Tabular):
     @property
     def table(self) -> Table:
         """Table: a row for each law, and one for the measured velocities."""
-        unit = "m/s" if self.scene.walls is not None else ""  # others may be rad/s
+        # others may be rad/s
+        if self.scene.walls is not None:
+            unit = "m/s"
+        else:
+            unit = ""
         columns = (
             Column("law"),
-            *(Column(f"v_{i + 1}_plus", ".5f", f"v{i + 1}+", unit) for i in range(self.scene.size)),
+            *(
+                Column(f"v_{i + 1}_plus", ".5f", f"v{i + 1}+", unit)
+                for i in range(self.scene.size)
+            ),
             Column("energy_ratio", ".4f", "T+/T-"),
             Column("dispersion", ".3f"),
             Column("time_s", microseconds, "time", "µs"),
@@ -132,7 +162,9 @@ class Comparison(Tabular):
         if self.closest:
             rms = self.distances[self.closest[0]]
             named = ", ".join(self.closest)
-            notes.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
+            notes.append(
+                f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)"
+            )
         notes += left_out_notes(self.left_out)
         why_no_impact = nothing_approaches(self.scene, self.velocity)
         if why_no_impact is not None:
@@ -143,19 +175,20 @@ class Comparison(Tabular):
 def compare(
     scene: Scene, velocity: Any, laws: Mapping[str, Law] | None = None, **values: Any
 ) -> Comparison:
-    """Outcomes of several laws on one impact: velocities, energy, dispersion, audit, time.
+    """Outcomes of laws on one impact: velocities, energy, dispersion, audit, time.
 
     Args:
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
         laws: by name; default: every law of the registry, with these
-        values: parameters by name, `restitution=0.9, stiffness=..., exponent=..., matrix=...`
-            (laws that need others are left out, see `left_out`); restitution is 1 unless
+        values: parameters by name, `restitution=0.9, stiffness=..., exponent=...,
+            matrix=...` (laws that need others are left out, see `left_out`);
+            restitution is 1 unless
             it is among them.
 
     Returns:
-        `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison` a picture.
-        A law that raises is left out, and the table says why.
+        `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison`
+        a picture. A law that raises is left out, and the table says why.
 
     Raises:
         ValueError: velocities of another size or NaN; both `laws` and values.
@@ -172,12 +205,16 @@ def compare(
         laws, left_out = registered_laws({"restitution": 1.0} | values)
     elif values:
         raise ValueError(
-            f"Argument `laws` must be None where parameters are given, but {', '.join(values)} "
+            f"Argument `laws` must be None where parameters are given, but "
+            f"{', '.join(values)} "
             "came with it."
         )
     check_kind("laws", laws, Mapping)
-    # the first calls, with compiling, sort out the laws that raise; then all are timed in turns
-    first, raised = at_points({n: partial(_first_call, law, scene) for n, law in laws.items()}, v)
+    # the first calls, with compiling, sort out the laws that raise; then all are timed
+    # in turns
+    first, raised = at_points(
+        {n: partial(_first_call, law, scene) for n, law in laws.items()}, v
+    )
     runs = {name: partial(impact, laws[name], scene, v) for name in first}
     each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))
     times = {name: float(np.median(x)) for name, x in each.items()}

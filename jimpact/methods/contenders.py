@@ -1,6 +1,8 @@
-"""Contenders of the chart and of the map: ways to integrate an LZB impact, one value each.
+"""Contenders of the chart and of the map: ways to integrate an LZB impact, one value
+each.
 
-A contender of your own is a function and its settings, and stands in the chart beside the others:
+A contender of your own is a function and its settings, and stands in the chart beside
+the others:
 
 >>> import jimpact as ji
 >>> from jimpact.methods.contenders import Contender, Solution
@@ -43,16 +45,17 @@ class Contender(NamedTuple):
     Attributes:
         name: in tables and options.
         solve: `solve(law, scene, velocity, setting) -> Solution`.
-        setting: the kind of number that `solve` takes: 'rtol', a tolerance on velocities relative
-            to the largest |v-|; 'step', the time step in units of `schemes.time_scale`; or 'impulse
-            step', the step in the primary impulse, in units of the impact's momentum.
+        setting: the kind of number that `solve` takes: 'rtol', a tolerance on
+            velocities relative to the largest |v-|; 'step', the time step in units of
+            `schemes.time_scale`; or 'impulse step', the step in the primary impulse, in
+            units of the impact's momentum.
         ladder: settings from coarse to fine.
         label: in pictures; '': the name.
         divides: by e, which must not be 0.
         friction: whether it has Coulomb friction.
         springs: whether it has tangential springs below Coulomb's limit.
-        jax: whether `solve` can be jitted, vmapped and differentiated forward, over the setting
-            too; otherwise it gets concrete values.
+        jax: whether `solve` can be jitted, vmapped and differentiated forward, over the
+            setting too; otherwise it gets concrete values.
         duration_apart: whether the duration takes a run of its own.
     """
 
@@ -68,13 +71,17 @@ class Contender(NamedTuple):
     duration_apart: bool = False
 
     def supports(self, law: LZB) -> str | None:
-        """None, or the reason why it cannot integrate this law, to follow the word "it"."""
+        """None, or the reason why it cannot integrate this law, to follow the word
+        "it".
+        """
         if law.friction is not None and not self.friction:
             return "has no friction"
         if law.tangential_stiffness is not None and not self.springs:
             return "has no tangential springs"
         refused = self.divides and np.any(law.restitution == 0)
-        return "divides by e^2, and a restitution is 0" if refused else None
+        if refused:
+            return "divides by e^2, and a restitution is 0"
+        return None
 
 
 class _KnownImpulses(Law):
@@ -91,28 +98,42 @@ class _KnownImpulses(Law):
 
 
 def outcome(law: LZB, scene: Scene, velocity: Any, solution: Solution) -> Impact:
-    """The `Impact` of a solution's impulses: velocities, energy, status by `impact`'s checks."""
+    """The `Impact` of a solution's impulses: velocities, energy, status by `impact`'s
+    checks.
+    """
     if law.friction is not None and solution.tangential is None:
-        raise ValueError("A contender with friction must return `tangential` impulses (t,).")
+        raise ValueError(
+            "A contender with friction must return `tangential` impulses (t,)."
+        )
     code = jax.numpy.asarray(solution.code)
-    known = _KnownImpulses(solution.impulse, solution.tangential, code, law.initial_energy)
+    known = _KnownImpulses(
+        solution.impulse, solution.tangential, code, law.initial_energy
+    )
     return impact(known, scene, velocity)
 
 
 def solved(
     contender: Contender, law: LZB, scene: Scene, velocity: Any, setting: Any
 ) -> tuple[Impact, Outcomes]:
-    """Impact by a contender at one setting, and the same as `Outcomes`, to be compared."""
+    """Impact by a contender at one setting, and the same as `Outcomes`, to be
+    compared.
+    """
     solution = contender.solve(law, scene, velocity, setting)
     out = outcome(law, scene, velocity, solution)
     return out, Outcomes.of(out, solution)
 
 
 _TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)  # in units of `time_scale`, coarse to fine
-_TO_NINE, _TO_ELEVEN = (1e-3, 1e-5, 1e-7, 1e-9), (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
+_TO_NINE = (1e-3, 1e-5, 1e-7, 1e-9)
+_TO_ELEVEN = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 _ALL = (
     Contender(
-        *("impulse_euler", schemes.impulse_euler, "impulse step", (1e-2, 3e-3, 1e-3, 3e-4)),
+        *(
+            "impulse_euler",
+            schemes.impulse_euler,
+            "impulse step",
+            (1e-2, 3e-3, 1e-3, 3e-4),
+        ),
         label="impulse, Euler (published)",
         divides=False,
     ),
@@ -170,17 +191,21 @@ CONTENDERS: dict[str, Contender] = {each.name: each for each in _ALL}
 def contenders_of(
     argument: str, methods: Sequence[str | Contender], known: Mapping[str, Contender]
 ) -> list[Contender]:
-    """Contenders by name among those `known`, or a user's own with other names, each once.
+    """Contenders by name among those `known`, or a user's own with other names, each
+    once.
 
     `argument` is the name of the caller's argument in errors.
     """
     if isinstance(methods, str | Contender):
-        raise TypeError(f"Argument `{argument}` must be a list, but is {short_repr(methods)}.")
+        raise TypeError(
+            f"Argument `{argument}` must be a list, but is {short_repr(methods)}."
+        )
     chosen = [_contender_of(argument, method, known) for method in methods]
     names = [each.name for each in chosen]
     if not names or len(set(names)) < len(names):
         raise ValueError(
-            f"Argument `{argument}` must have one contender or more, each once, but has {names}."
+            f"Argument `{argument}` must have one contender or more, each once, but "
+            f"has {names}."
         )
     return chosen
 
@@ -195,6 +220,7 @@ def _contender_of(
     check_choice(f"{argument}.setting", method.setting, SETTING_KINDS)
     if CONTENDERS.get(method.name, method) is not method:
         raise ValueError(
-            f"Argument `{argument}` must have contenders of new names, but has {method.name!r}."
+            f"Argument `{argument}` must have contenders of new names, but has "
+            f"{method.name!r}."
         )
     return method

@@ -1,4 +1,6 @@
-"""Pictures of error against time, of stability, of where laws are valid, and of advice."""
+"""Pictures of error against time, of stability, of where laws are valid, and of
+advice.
+"""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -40,9 +42,14 @@ _LAW_MARKERS = "*phX8d"
 _LEAST = 1e-16  # smaller relative errors are drawn here: rounding
 _DEFAULT = "time"  # what `impact` does: a thick line
 
-# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: colours for
-# returned results, greys for none
-CLASS_COLOURS = (*(COLOURS[i] for i in (2, 4, 1, 3, 5)), "#999999", "#000000", "#DDDDDD")
+# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked:
+# colours for returned results, greys for none
+CLASS_COLOURS = (
+    *(COLOURS[i] for i in (2, 4, 1, 3, 5)),
+    "#999999",
+    "#000000",
+    "#DDDDDD",
+)
 _LABELS = {
     "setting": "setting, 1 finest",
     "restitution": "restitution e",
@@ -60,11 +67,12 @@ _STYLES = {"moreau": "--", "binary": ":"}
 
 @styled(WorkPrecision)
 def work_precision(result: WorkPrecision, title: str = "") -> Figure:
-    """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
+    """Error of v+, and of its gradient, against time and against evaluations.
 
-    Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker on
-    a line is a failure by status. Lines have their names at their ends; laws are grey markers at
-    their model error; below the grey band's edge the reference is no better.
+    Times are per impact in a batch, with error bars from quartile to quartile; a hollow
+    marker on a line is a failure by status. Lines have their names at their ends; laws
+    are grey markers at their model error; below the grey band's edge the reference is
+    no better.
 
     Args:
         result: what `ji.work_precision` returned.
@@ -83,34 +91,61 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     >>> len(ji.plot.work_precision(result).axes)
     2
     """
-    gradients = any(point.gradient is not None for row in result.points.values() for point in row)
-    count, height = (4, 3.6) if gradients else (2, 4.6)
+    gradients = any(
+        point.gradient is not None for row in result.points.values() for point in row
+    )
+    if gradients:
+        count = 4
+        height = 3.6
+    else:
+        count = 2
+        height = 4.6
     figure, panels = new_panels(count, height, title=title)
-    styles, ends = _styles(result.points), []
+    styles = _styles(result.points)
+    ends = []
     for axes, (quantity, against, label) in zip(panels, _PANELS):
         for name, row in result.points.items():
             at = _draw_errors(axes, row, quantity, against, styles[name])
             if at is not None and styles[name]["ls"] != "none":
                 ends.append(LineEnd(axes, at, name, styles[name]["color"]))
-        _finish_errors(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
+        _finish_errors(
+            axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity]
+        )
     if not gradients:
         legend_below(figure, 2, note=_reading_note(result))
     else:  # next to the three panels
-        lines = {x.get_label(): x for axes in panels for x in axes.get_legend_handles_labels()[0]}
+        lines = {
+            x.get_label(): x
+            for axes in panels
+            for x in axes.get_legend_handles_labels()[0]
+        }
         panels[3].axis("off")
-        panels[3].legend(handles=list(lines.values()), title=_reading_note(result), loc="center")
+        panels[3].legend(
+            handles=list(lines.values()), title=_reading_note(result), loc="center"
+        )
     label_ends(figure, ends)
     return figure
 
 
 def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]]:
-    """Options of matplotlib by name: methods by colour, laws (one point each) grey by marker."""
+    """Options of matplotlib by name: methods by colour, laws (one point each) grey by
+    marker.
+    """
     laws = [name for name, row in points.items() if row[0].setting is None]
     methods = [name for name in points if name not in laws]
     styles: dict[str, dict[str, Any]] = {}
     for i, (name, marker) in enumerate(zip(methods, cycle(MARKERS))):
-        line = "-" if i < len(COLOURS) else "--"
-        styles[name] = {"marker": marker, "ms": 5, "ls": line, "lw": 1.2, "color": colour_of(i)}
+        if i < len(COLOURS):
+            line = "-"
+        else:
+            line = "--"
+        styles[name] = {
+            "marker": marker,
+            "ms": 5,
+            "ls": line,
+            "lw": 1.2,
+            "color": colour_of(i),
+        }
     for name, marker in zip(laws, cycle(_LAW_MARKERS)):
         styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY}
     if _DEFAULT in styles:
@@ -127,17 +162,24 @@ _PANELS = (  # error, and what it is drawn against
 
 
 def _draw_errors(
-    axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
+    axes: Axes,
+    row: tuple[Point, ...],
+    quantity: str,
+    against: str,
+    style: dict[str, Any],
 ) -> tuple[float, float] | None:
-    """Draw the error of a `quantity` over times [µs] or counts, one point for each setting.
+    """Draw the error of a `quantity` over times [µs] or counts, one point for each
+    setting.
 
-    `against` is the field of `Point` on the x axis. Returns the end (x, y) of the line; None if no
-    point has both an error and a time or a count.
+    `against` is the field of `Point` on the x axis. Returns the end (x, y) of the line;
+    None if no point has both an error and a time or a count.
     """
     given = [getattr(point, against) for point in row]
     # median and quartiles of a time [µs], or three times the same count
     spans = [
-        1e6 * np.array(x) if isinstance(x, Timing) else np.full(3, np.nan if x is None else x)
+        1e6 * np.array(x)
+        if isinstance(x, Timing)
+        else np.full(3, np.nan if x is None else x)
         for x in given
     ]
     x, low, high = np.array(spans).T
@@ -157,12 +199,16 @@ def _draw_errors(
         **style,
     )
     failed = known & [STATUS[CODE[point.status]].failure for point in row]
-    axes.plot(x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4})
+    axes.plot(
+        x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4}
+    )
     return float(x[known][-1]), float(y[known][-1])
 
 
 def _finish_errors(axes: Axes, uncertainty: float, x: str, y: str) -> None:
-    """Logarithmic axes with labels, and the grey band up to the uncertainty of the reference."""
+    """Logarithmic axes with labels, and the grey band up to the uncertainty of the
+    reference.
+    """
     axes.set(xlabel=x, ylabel=y, yscale="log")
     low, high = axes.get_ylim()
     if np.isfinite(uncertainty) and uncertainty > 0:
@@ -174,17 +220,21 @@ def _finish_errors(axes: Axes, uncertainty: float, x: str, y: str) -> None:
 
 
 def _reading_note(result: WorkPrecision) -> str:
-    """Note below the chart: how errors and times were measured, and what grey and hollow mean."""
+    """Note below the chart: how errors and times were measured, and what grey and
+    hollow mean.
+    """
     return (
         f"errors: largest of {result.sample} impacts, stiffness\nspread over a factor "
-        f"{result.spread:g}; times: median\nand quartiles of {result.repeats}, batch of "
-        f"{result.batch};\ngrey: uncertainty of the reference;\nhollow: failed by status"
+        f"{result.spread:g}; times: median\nand quartiles of {result.repeats}, batch "
+        f"of "
+        f"{result.batch};\ngrey: uncertainty of the reference;\nhollow: failed by "
+        f"status"
     )
 
 
 @styled(StabilityMap)
 def stability_map(result: StabilityMap, title: str = "") -> Figure:
-    """One panel an axis: a row for each method, a column for each value; other axes at the base.
+    """One panel an axis: a row for each method, a column for each value.
 
     Args:
         result: what `stability_map` returned.
@@ -205,11 +255,16 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     names = list(result.axes)
     figure, grid = new_panels(len(names), 0.8 + 0.3 * len(result.methods), 1.2, title)
     for i, (axes, name) in enumerate(zip(grid, names)):
-        _draw_classes(axes, np.array([result.slices[method][i].codes for method in result.methods]))
+        _draw_classes(
+            axes,
+            np.array([result.slices[method][i].codes for method in result.methods]),
+        )
         _ticks(axes, "x", name, result.axes[name])
         axes.set_yticks(range(len(result.methods)), result.methods, fontsize=SMALL)
         axes.tick_params(labelleft=i % COLUMNS == 0)
-        axes.plot(_base_position(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
+        axes.plot(
+            _base_position(result, name), -0.62, "v", color="black", ms=5, clip_on=False
+        )
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
     _legend_of_classes(figure, result)
     return figure
@@ -239,10 +294,14 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
     """
     pairs = [each for each in result.slices[method] if len(each.axes) == 2]
     if not pairs:
-        raise ValueError("Argument `result` must be a map with slices='pairs', but has none.")
+        raise ValueError(
+            "Argument `result` must be a map with slices='pairs', but has none."
+        )
     names = list(result.axes)
     size = len(names) - 1
-    figure, grid = new_figure(1.6 + 1.5 * size, title or method, size, size, squeeze=False)
+    figure, grid = new_figure(
+        1.6 + 1.5 * size, title or method, size, size, squeeze=False
+    )
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
         _draw_pair(grid[row - 1, column], result, each)
@@ -265,7 +324,9 @@ def _draw_pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
 
 
 def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
-    """Draw a cell for each code (rows, columns) in the colour of its class, white lines between."""
+    """Draw a cell for each code (rows, columns) in the colour of its class, white lines
+    between.
+    """
     axes.imshow(codes, aspect="auto", interpolation="nearest", **by_code(CLASS_COLOURS))
     rows, columns = codes.shape
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
@@ -276,34 +337,48 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = _TICKS) -> None:
-    """Label at most `most` values of a map's axis `name` on a panel's axis 'x' or 'y'."""
+def _ticks(
+    axes: Axes, which: str, name: str, values: np.ndarray, most: int = _TICKS
+) -> None:
+    """Label at most `most` values of a map's axis `name` on a panel's axis 'x' or
+    'y'.
+    """
     at = range(0, len(values), -(-len(values) // most))
     axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_ticks(at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL)
+    axis.set_ticks(
+        at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL
+    )
     axis.set_label_text(_LABELS.get(name, name.replace("_", " ")), fontsize=SMALL)
 
 
 def _base_position(result: StabilityMap, name: str) -> float:
-    """Position of the base point on a panel's axis: its index among the values, interpolated."""
+    """Position of the base point on a panel's axis: its index among the values,
+    interpolated.
+    """
     values = result.axes[name]
     return float(np.interp(result.base[name], values, np.arange(len(values))))
 
 
 def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     """Draw a legend of the classes that occur in the slices."""
-    codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
+    codes = [
+        each.codes.ravel() for name in result.methods for each in result.slices[name]
+    ]
     labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
     occurring = np.unique(np.concatenate(codes))
-    legend_below(figure, 4, [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring])
+    legend_below(
+        figure, 4, [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring]
+    )
 
 
 @styled(ValidityMap)
-def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
-    """Dispersion against the stiffness ratio, and the errors of the laws that do not know it.
+def validity_map(
+    result: ValidityMap, tolerance: float = 1e-2, title: str = ""
+) -> Figure:
+    """Dispersion against the stiffness ratio, and errors of laws that do not know it.
 
-    Above one curve an exponent, between the levels of binary collisions and Moreau's law; below
-    how far off they are, with the tolerance.
+    Above one curve an exponent, between the levels of binary collisions and Moreau's
+    law; below how far off they are, with the tolerance.
 
     Args:
         result: what `ji.validity_map` returned.
@@ -317,24 +392,34 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
         TypeError: something else.
 
     >>> import jimpact as ji
-    >>> result = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
+    >>> result = ji.validity_map(
+    ...     ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0]
+    ... )
     >>> len(ji.plot.validity_map(result).axes)
     2
     """
     default = "Where the stiffness ratio may be left out"
     figure, (top, bottom) = new_figure(6.8, title or default, 2, 1, sharex=True)
-    for i, eta in enumerate(result.exponents):  # a colour an exponent, a line style a law
+    # a colour an exponent, a line style a law
+    for i, eta in enumerate(result.exponents):
         top.plot(result.ratios, result.dispersion[i], label=f"LZB, exponent {eta:g}")
         for name, style in _STYLES.items():
             error = np.maximum(result.error(name)[i], _LEAST)
             bottom.plot(result.ratios, error, style, color=colour_of(i))
     for name, style in _STYLES.items():
-        top.axhline(result.law_dispersion[name], color="black", ls=style, lw=1, label=name)
+        top.axhline(
+            result.law_dispersion[name], color="black", ls=style, lw=1, label=name
+        )
         bottom.plot([], [], style, color="black", label=name)
     bottom.axhline(tolerance, color=GREY, lw=1, label=f"tolerance {share(tolerance)}")
     top.set_ylabel("dispersion index (0: one body has it all)")
-    ratio = "k2/k1" if result.scene.contacts == 2 else "of neighbours"
-    bottom.set(xlabel=f"stiffness ratio {ratio}", ylabel="error of v+, relative to max |v-|")
+    if result.scene.contacts == 2:
+        ratio = "k2/k1"
+    else:
+        ratio = "of neighbours"
+    bottom.set(
+        xlabel=f"stiffness ratio {ratio}", ylabel="error of v+, relative to max |v-|"
+    )
     bottom.set(yscale="log", ylim=(1e-5, None))
     logarithmic(bottom, "y")
     logarithmic(bottom, "x")
@@ -345,14 +430,14 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
 
 @styled(Advice)
 def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure:
-    """Outcomes of every law, with their range over the unknown ratios, above their errors.
+    """Outcomes of every law over the unknown ratios, above their errors.
 
     Args:
         result: what `ji.advise` returned.
         title: above the picture.
-        names: of the velocities with their units, as `body.velocity_names`: each unit has a panel
-            of its own. Without names those of a chain are in m/s; others stand times the root of
-            their inertia, in √J.
+        names: of the velocities with their units, as `body.velocity_names`: each unit
+            has a panel of its own. Without names those of a chain are in m/s; others
+            stand times the root of their inertia, in √J.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -361,35 +446,58 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
         TypeError: something else. ValueError: another number of names.
 
     >>> import jimpact as ji
-    >>> result = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
+    >>> result = ji.advise(
+    ...     ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False
+    ... )
     >>> len(ji.plot.advice(result).axes)
     2
     """
-    laws, rows = list(result.candidates), list(result.candidates.values())
-    named = [name if c.usable else f"{name}_({c.status})" for name, c in zip(laws, rows)]
+    laws = list(result.candidates)
+    rows = list(result.candidates.values())
+    named = [
+        name if c.usable else f"{name}_({c.status})" for name, c in zip(laws, rows)
+    ]
     figure, tops, bottom = panels_of_laws(named, result.scene, names, "", 1.8)
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
-    figure.axes[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
+    figure.axes[0].set_title(
+        f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large"
+    )
     x = np.arange(len(laws))
-    for top, velocities in tops:  # a panel for each unit: index, name and factor of each velocity
+    # a panel for each unit: index, name and factor of each velocity
+    for top, velocities in tops:
         for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
-            label = word if len(velocities) <= len(COLOURS) else None
-            v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
+            if len(velocities) <= len(COLOURS):
+                label = word
+            else:
+                label = None
+            v, low, high = (
+                factor
+                * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
+            )
             top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
             top.plot(x + offset, v, "o", color=colour_of(i), label=label)
     chosen = laws.index(result.name)
     for axes in figure.axes:
-        label = "advised" if axes is bottom else None
+        if axes is bottom:
+            label = "advised"
+        else:
+            label = None
         axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
     errors = np.array([(c.worst, c.median) for c in rows]).T
-    beyond = errors > ROUNDING  # what is smaller has no place on a logarithmic axis: words
+    # what is smaller has no place on a logarithmic axis: words
+    beyond = errors > ROUNDING
     lowest = min(result.tolerance / 1000, errors[beyond].min(initial=1.0))
     worst, median = np.where(beyond, errors, np.nan)
-    bottom.vlines(x, np.where(np.isnan(median), lowest / 2, median), worst, color=GREY, lw=1)
+    bottom.vlines(
+        x, np.where(np.isnan(median), lowest / 2, median), worst, color=GREY, lw=1
+    )
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
     for j in np.flatnonzero(~beyond[0]):
-        what = "reference" if laws[j] == result.reference else "rounding"
+        if laws[j] == result.reference:
+            what = "reference"
+        else:
+            what = "rounding"
         write(bottom, (j, lowest), what)
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set(yscale="log", ylim=(lowest / 2, 10))

@@ -1,4 +1,6 @@
-"""Pictures of laws side by side: their velocities, and energy against its dispersion."""
+"""Pictures of laws side by side: their velocities, and energy against its
+dispersion.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -36,16 +38,16 @@ def comparison(
 ) -> Figure:
     """Velocities after the impact by law, energy ratios T+/T- and dispersion indices.
 
-    Measured velocities are horizontal lines, and the laws closest to them are highlighted; a law
-    whose outcome fails the audit is crossed.
+    Measured velocities are horizontal lines, and the laws closest to them are
+    highlighted; a law whose outcome fails the audit is crossed.
 
     Args:
         result: what `ji.compare` returned.
         measured: v+ (n,) [m/s]; None: those of `result`, if it has any.
         title: above the picture.
-        names: of the velocities with their units, as `body.velocity_names`: each unit has a panel
-            of its own. Without names those of a chain are in m/s; others stand times the root of
-            their inertia, in √J.
+        names: of the velocities with their units, as `body.velocity_names`: each unit
+            has a panel of its own. Without names those of a chain are in m/s; others
+            stand times the root of their inertia, in √J.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -54,47 +56,66 @@ def comparison(
         TypeError: something else. ValueError: another number of names.
 
     >>> import jimpact as ji
-    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+    >>> result = ji.compare(
+    ...     ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)}
+    ... )
     >>> len(ji.plot.comparison(result).axes)
     2
     """
     if measured is not None:
         result = dataclasses.replace(result, measured=np.asarray(measured))
-    laws, entries = list(result.entries), list(result.entries.values())
+    laws = list(result.entries)
+    entries = list(result.entries.values())
     figure, tops, bottom = panels_of_laws(laws, result.scene, names, title, 1.2)
-    at, velocity = np.arange(len(entries)), np.array([x.outcome.velocity for x in entries])
+    at = np.arange(len(entries))
+    velocity = np.array([x.outcome.velocity for x in entries])
     wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
-    for top, velocities in tops:  # a panel for each unit: index, name and factor of each velocity
-        for (i, label, factor), offset in zip(velocities, side_by_side(len(velocities))):
-            x, y, colour = at + offset, factor * velocity[:, i], colour_of(i)
+    # a panel for each unit: index, name and factor of each velocity
+    for top, velocities in tops:
+        for (i, label, factor), offset in zip(
+            velocities, side_by_side(len(velocities))
+        ):
+            x = at + offset
+            y = factor * velocity[:, i]
+            colour = colour_of(i)
             top.plot(x, y, "o", color=colour, label=label)
             top.plot(x[wrong], y[wrong], "x", color="black", ms=10)
             if result.measured is not None:
                 level = [factor * result.measured[i]] * 2
-                top.plot([-0.5, len(at) - 0.5], level, "--", color=colour, lw=1, zorder=0)
+                top.plot(
+                    [-0.5, len(at) - 0.5], level, "--", color=colour, lw=1, zorder=0
+                )
         top.axhline(0, color="black", lw=0.6)
     if result.measured is not None:
         bottom.plot([], [], "--", color="black", lw=1, label="measured")
     if wrong.any():
         bottom.plot([], [], "x", color="black", ms=10, label="audit failed")
-    kept, spread = [x.energy_ratio for x in entries], [x.dispersion_index for x in entries]
+    kept = [x.energy_ratio for x in entries]
+    spread = [x.dispersion_index for x in entries]
     bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy ratio T+/T-")
     bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
     bottom.set_ylabel("ratio, index")
     for place in map(laws.index, result.closest):
         label = "closest to the measured velocities"
         for axes in figure.axes:
-            axes.axvspan(place - 0.48, place + 0.48, color=HIGHLIGHT, lw=0, zorder=-1, label=label)
+            axes.axvspan(
+                place - 0.48,
+                place + 0.48,
+                color=HIGHLIGHT,
+                lw=0,
+                zorder=-1,
+                label=label,
+            )
     legend_below(figure, 4)
     return figure
 
 
 @styled(Comparison)
 def energy_plane(result: Comparison, title: str = "") -> Figure:
-    """Every law in the plane of energy kept (K_ER = T+/T-) and of its dispersion (C_KE).
+    """Every law in the plane of energy kept (K_ER) and of its dispersion (C_KE).
 
-    Dots are samples of the outcomes that mechanics allows; a law whose outcome fails the audit is
-    hollow.
+    Dots are samples of the outcomes that mechanics allows; a law whose outcome fails
+    the audit is hollow.
 
     Args:
         result: what `ji.compare` returned.
@@ -107,25 +128,42 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
         TypeError: something else.
 
     >>> import jimpact as ji
-    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+    >>> result = ji.compare(
+    ...     ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)}
+    ... )
     >>> ji.plot.energy_plane(result).axes[0].get_xlabel()
     'energy ratio K_ER = T+/T-'
     """
     figure, axes = new_figure(5.4, title)
     allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
     axes.plot(
-        *_kept_and_spread(result, allowed), ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed"
+        *_kept_and_spread(result, allowed),
+        ".",
+        color=COLOURS[4],
+        alpha=0.3,
+        ms=3,
+        label="allowed",
     )
     for i, (name, entry) in enumerate(result.entries.items()):
         at = _kept_and_spread(result, np.asarray(entry.outcome.velocity)[None])
         mark(axes, np.ravel(at), name, i, bool(entry.audit.consistent))
-    axes.set(xlabel="energy ratio K_ER = T+/T-", ylabel="energy dispersion C_KE (0: equal shares)")
+    axes.set(
+        xlabel="energy ratio K_ER = T+/T-",
+        ylabel="energy dispersion C_KE (0: equal shares)",
+    )
     legend_below(figure, 4)
     return figure
 
 
-def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Energy ratio K_ER = T+/T- (k,) and energy dispersion C_KE (k,) of velocities v+ (k, n)."""
-    v, scene = jnp.asarray(after), result.scene
+def _kept_and_spread(
+    result: Comparison, after: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Energy ratio K_ER = T+/T- (k,) and energy dispersion C_KE (k,) of velocities v+
+    (k, n).
+    """
+    v = jnp.asarray(after)
+    scene = result.scene
     kept = jax.vmap(lambda x: energy_ratio(scene, result.velocity, x))(v)
-    return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
+    return np.asarray(kept), np.asarray(
+        jax.vmap(lambda x: energy_dispersion(scene, x))(v)
+    )

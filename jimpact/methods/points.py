@@ -1,4 +1,6 @@
-"""Candidates at points against a reference: outcomes in batches, their errors, and their times."""
+"""Candidates at points against a reference: outcomes in batches, their errors, and
+their times.
+"""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +19,8 @@ from jimpact.tools.threads import in_parts
 
 Result = TypeVar("Result")
 
-SHORT = 2e-3  # [s]: calls that are faster are run several times for one measurement, so that the
+# [s]: calls that are faster are run several times for one measurement, so that the
+SHORT = 2e-3
 MOST_RUNS = 20  # clock's resolution does not count, but no more often than this
 UNCOUNTED = -1  # evaluations of a method that does not count them
 LEAST_REPEATS = 3  # measurements of each run; ..
@@ -25,9 +28,11 @@ BUDGET = 2.0  # .. more of them only within so many seconds of calls
 
 
 class Solution(NamedTuple):
-    """Impulses (m,) [N s], status (), duration () [s], field evaluations (), impulses (t,) [N s].
+    """Impulses (m,) [N s], status (), duration () [s], field evaluations (), impulses
+    (t,) [N s].
 
-    NaN: a duration that is not known; `UNCOUNTED`: evaluations likewise; None: no friction.
+    NaN: a duration that is not known; `UNCOUNTED`: evaluations likewise; None: no
+    friction.
     """
 
     impulse: Any
@@ -41,7 +46,9 @@ TIMELESS = Solution(None)  # of a law, whose impacts are not integrated in time
 
 
 class Outcomes(NamedTuple):
-    """Numbers of r impacts, to be compared between laws or methods; JAX arrays, or NumPy's."""
+    """Numbers of r impacts, to be compared between laws or methods; JAX arrays, or
+    NumPy's.
+    """
 
     velocity: Any  # v+ (r, n) [m/s]
     impulse: Any  # p (r, m) [N s]
@@ -55,9 +62,14 @@ class Outcomes(NamedTuple):
 
     @classmethod
     def of(cls, out: Impact, solution: Solution = TIMELESS) -> "Outcomes":
-        """Numbers of an impact, and of the contender's solution that it was made of, if any."""
-        energy, work = out.energy_change, (solution.code, solution.duration, solution.evaluations)
-        return cls(out.velocity, out.impulse, out.tangential_impulse, energy, out.status, *work)
+        """Numbers of an impact, and of the contender's solution that it was made of, if
+        any.
+        """
+        energy = out.energy_change
+        work = (solution.code, solution.duration, solution.evaluations)
+        return cls(
+            out.velocity, out.impulse, out.tangential_impulse, energy, out.status, *work
+        )
 
     @property
     def failed(self) -> np.ndarray:
@@ -78,15 +90,20 @@ class Outcomes(NamedTuple):
 
 
 @precise_jit
-def varied_impacts(law: Law, scene: Scene, velocity: jax.Array, varied: dict[str, Any]) -> Outcomes:
-    """Outcomes (r,) of impacts at v- (n,) [m/s] with the arguments `varied`, a row each.
+def varied_impacts(
+    law: Law, scene: Scene, velocity: jax.Array, varied: dict[str, Any]
+) -> Outcomes:
+    """Outcomes (r,) of impacts at v- (n,) [m/s] with the arguments `varied`, a row
+    each.
 
     Names are `velocity` (r, n), `gaps` (r, m) [m], or parameters of the law (r, ...).
     """
 
     def one(values: dict[str, jax.Array]) -> Outcomes:
         """Outcome with one row of the arguments `values`."""
-        one_scene, one_law, v = scene, law, velocity
+        one_scene = scene
+        one_law = law
+        v = velocity
         for name, value in values.items():
             if name == "velocity":
                 v = value
@@ -110,14 +127,26 @@ class EnergyNorm(NamedTuple):
     watched: np.ndarray
 
     @classmethod
-    def of(cls, scene: Scene, velocity: np.ndarray, watched: Any = None) -> "EnergyNorm":
-        """Norm of a scene at v- (n,) over the coordinates `watched` (indices), None: all."""
+    def of(
+        cls, scene: Scene, velocity: np.ndarray, watched: Any = None
+    ) -> "EnergyNorm":
+        """Norm of a scene at v- (n,) over the coordinates `watched` (indices), None:
+        all.
+        """
         count = scene.size
-        index = np.arange(count) if watched is None else np.atleast_1d(np.asarray(watched))
-        whole = index.ndim == 1 and index.size > 0 and np.issubdtype(index.dtype, np.integer)
+        if watched is None:
+            index = np.arange(count)
+        else:
+            index = np.atleast_1d(np.asarray(watched))
+        whole = (
+            index.ndim == 1
+            and index.size > 0
+            and np.issubdtype(index.dtype, np.integer)
+        )
         if not whole or index.min() < 0 or index.max() >= count:
             raise ValueError(
-                f"Argument `watched` must be indices of coordinates from 0 to {count - 1}, but has "
+                f"Argument `watched` must be indices of coordinates from 0 to "
+                f"{count - 1}, but has "
                 f"value {watched!r}."
             )
         mass = dense_mass(scene)
@@ -138,8 +167,8 @@ def in_batches(
 ) -> Any:
     """Results of `run` over rows, `size` of them at a time, on all cores.
 
-    Rows are a tree of arrays (r, ...), results trees with the same r. `advance` is called with the
-    number of rows of each batch.
+    Rows are a tree of arrays (r, ...), results trees with the same r. `advance` is
+    called with the number of rows of each batch.
     """
     count = len(jax.tree.leaves(rows)[0])
     parts: list[Any] = []
@@ -153,9 +182,11 @@ def in_batches(
 def at_points(
     candidates: Mapping[str, Callable[[Any], Result]], points: Any
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """Results of candidates, functions of the points, by name, and reasons why some are missing.
+    """Results of candidates, functions of the points, by name, and reasons why some are
+    missing.
 
-    A user's law or contender may fail in any way: one that raises is left out, the others stand.
+    A user's law or contender may fail in any way: one that raises is left out, the
+    others stand.
     """
     results: dict[str, Result] = {}
     left_out: dict[str, str] = {}
@@ -169,12 +200,16 @@ def at_points(
 
 
 def left_out_notes(left_out: Mapping[str, str], what: str = "is left out") -> list[str]:
-    """A line of a table's notes for each candidate that is left out, or that lacks something."""
+    """A line of a table's notes for each candidate that is left out, or that lacks
+    something.
+    """
     return [f"{name} {what}: it {why}" for name, why in left_out.items()]
 
 
 def relative_error(value: Any, exact: Any, scale: Any = 1.0) -> np.ndarray:
-    """`max_i |value_i - exact_i| / scale` (...) over the last axis of arrays (..., n)."""
+    """`max_i |value_i - exact_i| / scale` (...) over the last axis of arrays (...,
+    n).
+    """
     return np.abs(np.asarray(value) - exact).max(axis=-1) / scale
 
 
@@ -187,14 +222,19 @@ def seconds(run: Callable[[], Any], count: int = 1) -> float:
 
 
 def in_turns(
-    runs: Sequence[Callable[[], Any]], repeats: int, advance: Callable[[], Any] = lambda: None
+    runs: Sequence[Callable[[], Any]],
+    repeats: int,
+    advance: Callable[[], Any] = lambda: None,
 ) -> list[np.ndarray]:
-    """Times a call [s] of each of `runs`, from `repeats` measurements, or fewer of slow ones.
+    """Times a call [s] of each of `runs`, from `repeats` measurements, or fewer of slow
+    ones.
 
-    In turns, one measurement of each run after the other: a busy machine slows all alike. Fast runs
-    are called several times in one measurement. `advance` is called after each measurement.
+    In turns, one measurement of each run after the other: a busy machine slows all
+    alike. Fast runs are called several times in one measurement. `advance` is called
+    after each measurement.
     """
-    warm = [min(seconds(run), seconds(run)) for run in runs]  # the first call may compile
+    # the first call may compile
+    warm = [min(seconds(run), seconds(run)) for run in runs]
     counts = [int(np.clip(SHORT / max(t, 1e-9), 1, MOST_RUNS)) for t in warm]
     times: list[list[float]] = [[] for _ in runs]
     for _ in range(repeats):

@@ -1,4 +1,6 @@
-"""The simplest scene that suffices for an impact: contacts and friction that may be left out."""
+"""The simplest scene that suffices for an impact: contacts and friction that may be
+left out.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,23 +22,24 @@ from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import as_whole, check_kind, check_shape, check_values
 from jimpact.tools.records import Column, Table, Tabular, fields_as_data, listed
 
-# Impacts computed together, and the entries of their Delassus matrices. Ten times more take ten
-# times the memory, a gigabyte, and are not faster.
-LANES, ENTRIES = 64, 2**24
+# Impacts computed together, and the entries of their Delassus matrices. Ten times more
+# take ten times the memory, a gigabyte, and are not faster.
+LANES = 64
+ENTRIES = 2**24
 PRINTED = 12  # contacts in the printed table; ten times more fill three pages
 
 
 @dataclass(frozen=True)
 class SceneAdvice(Tabular):
-    """The result of `simplest_scene`; `ji.impact(result.law, result.scene, velocity)` applies it.
+    """The result of `simplest_scene`, for `ji.impact(result.law, result.scene, v)`.
 
-    Errors are changes of v+ in the energy norm over that of v-. NaN: the law fails without this
-    contact, or `runs` did not suffice.
+    Errors are changes of v+ in the energy norm over that of v-. NaN: the law fails
+    without this contact, or `runs` did not suffice.
 
     Attributes:
         law: the law, without friction where that suffices.
-        scene: the scene in which contacts are left out (they have an infinite gap), with one
-            tangent for each contact, or none, where that suffices.
+        scene: the scene in which contacts are left out (they have an infinite gap),
+            with one tangent for each contact, or none, where that suffices.
         kept: contacts (from 0) that are not left out.
         error: of v+ with this law and scene.
         tolerance: as passed.
@@ -71,50 +74,75 @@ class SceneAdvice(Tabular):
             return "left out: open"
         if not block.approaches:
             return "left out: nothing approaches"
-        return "left out: no effect" if self.impulses[contact] else "left out: no impulse"
+        if self.impulses[contact]:
+            return "left out: no effect"
+        return "left out: no impulse"
 
     def to_dict(self) -> dict[str, Any]:
-        """Numbers of all contacts, as a JSON file can hold them; contacts counted from 1."""
+        """Numbers of all contacts, as a JSON file can hold them; contacts counted from
+        1.
+        """
         kept = {"kept": [j + 1 for j in self.kept]}
         return fields_as_data(self, "law", "scene", "blocks", "kept") | kept
 
     @property
     def table(self) -> Table:
-        """Table: kept contacts and friction, then a row for each contact, largest error first."""
+        """Table: kept contacts and friction, then a row for each contact, largest error
+        first.
+        """
         m = len(self.names)
         head = [
             f"{len(self.kept)} of {m} contacts suffice within {share(self.tolerance)}; "
             f"the error of v+ is {share(self.error)}"
         ]
         head += [
-            f"friction, {name}: " + (f"error {share(x)}" if np.isfinite(x) else "the law fails")
+            f"friction, {name}: "
+            + (f"error {share(x)}" if np.isfinite(x) else "the law fails")
             for name, x in self.friction.items()
         ]
         for block in self.blocks[:PRINTED]:
             ends = block.angles
-            angles = f"; kinetic angles {ends[0]:.0f} to {ends[1]:.0f} degrees" if ends else ""
+            if ends:
+                angles = f"; kinetic angles {ends[0]:.0f} to {ends[1]:.0f} degrees"
+            else:
+                angles = ""
             some = listed([str(j + 1) for j in block.contacts])
-            state = "impact" if block.approaches else "nothing approaches"
+            if block.approaches:
+                state = "impact"
+            else:
+                state = "nothing approaches"
             head.append(f"group of contacts {some}: {state}{angles}")
         order = np.argsort(-np.nan_to_num(self.errors, nan=np.inf), kind="stable")
         columns = (
             Column("contact"),
             Column("impulse", ".3g", unit="N s"),
-            Column("error", lambda x: share(x) if np.isfinite(x) else "not known", "error without"),
+            Column(
+                "error",
+                lambda x: share(x) if np.isfinite(x) else "not known",
+                "error without",
+            ),
             Column("change", ".2g", "change of v+"),
             Column("advice"),
         )
         values = self.impulses, self.errors, self.changes
         rows = [
-            [f"{j + 1} {self.names[j]}".strip(), *(x[j] for x in values), self.reason(int(j))]
+            [
+                f"{j + 1} {self.names[j]}".strip(),
+                *(x[j] for x in values),
+                self.reason(int(j)),
+            ]
             for j in order
         ]
         return Table(columns, rows, [*head, ""])
 
     def __str__(self) -> str:
         """The first `PRINTED` rows of the table: half a page."""
-        table, more = self.table, len(self.names) - PRINTED
-        notes = [f"and {more} more"] if more > 0 else []
+        table = self.table
+        more = len(self.names) - PRINTED
+        if more > 0:
+            notes = [f"and {more} more"]
+        else:
+            notes = []
         return str(replace(table, rows=table.rows[:PRINTED], notes=notes))
 
 
@@ -128,13 +156,14 @@ def simplest_scene(
     watched: Any = None,
     runs: int = 256,
 ) -> SceneAdvice:
-    """Find the contacts, and the friction, that an impact needs for v+ within `tolerance`.
+    """Find the contacts, and the friction, that v+ needs within `tolerance`.
 
-    Equation: error `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the change of v+ by what is left out.
-    A contact without impulse can be left out exactly: nothing approaches in its group of coupled
-    contacts, or no load reaches it. Each of the others is left out by itself, then together with
-    those of smaller errors, where `tolerance` allows it. Before that, friction is left out, or
-    given one direction at each contact, that of its impulse (planar), where that suffices.
+    Equation: error `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the change of v+ by what is
+    left out. A contact without impulse can be left out exactly: nothing approaches in
+    its group of coupled contacts, or no load reaches it. Each of the others is left out
+    by itself, then together with those of smaller errors, where `tolerance` allows it.
+    Before that, friction is left out, or given one direction at each contact, that of
+    its impulse (planar), where that suffices.
 
     Args:
         law: as for `impact`.
@@ -142,8 +171,8 @@ def simplest_scene(
         velocity: v- (n,) [m/s, rad/s].
         tolerance: of the error, in (0, 1).
         names: of the contacts (m,), for the table, as `from_mujoco` gives them.
-        watched: indices of the coordinates whose velocities count; None: all. A contact that a wave
-            reaches too late to change them has the error 0.
+        watched: indices of the coordinates whose velocities count; None: all. A contact
+            that a wave reaches too late to change them has the error 0.
         runs: largest number of contacts left out one by one, those of the largest
             `p_j sqrt(W_jj)`, and of impacts with several left out.
 
@@ -155,7 +184,9 @@ def simplest_scene(
         RuntimeError: the law fails on the whole scene.
 
     >>> import jimpact as ji
-    >>> advice = ji.simplest_scene(ji.Moreau(1.0), ji.chain([1.0, 1.0, 1e-6]), [1.0, 0.0, 0.0])
+    >>> advice = ji.simplest_scene(
+    ...     ji.Moreau(1.0), ji.chain([1.0, 1.0, 1e-6]), [1.0, 0.0, 0.0]
+    ... )
     >>> advice.kept, round(float(advice.errors[1]), 4)
     ((0,), 0.001)
     """
@@ -166,7 +197,10 @@ def simplest_scene(
     check_shape("tolerance", tolerance, (), "one number")
     check_values("tolerance", tolerance, low=0.0, high=1.0, open_low=True)
     as_whole("runs", runs, 1)
-    labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
+    if names is None:
+        labels = ("",) * scene.contacts
+    else:
+        labels = tuple(map(str, names))
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
     trial = _ReducedImpact(law, scene, v, norm)
@@ -174,7 +208,9 @@ def simplest_scene(
     reference.check_first("The law fails on the whole scene")
     friction, trial = _simplest_friction(trial, reference, tolerance)
     working, errors, changes = _effect_of_each_contact(trial, runs)
-    kept, error = _sufficient_contacts(trial, reference, working, errors, tolerance, runs)
+    kept, error = _sufficient_contacts(
+        trial, reference, working, errors, tolerance, runs
+    )
     taking_part = scene.closed
     if law.uses_gaps and scene.gaps is not None:
         taking_part = jnp.isfinite(scene.gaps)
@@ -191,12 +227,16 @@ def simplest_scene(
         impulses=reference.impulse[0],
         errors=errors,
         changes=changes,
-        blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking_part)), has_friction),
+        blocks=blocks_of(
+            trial.scene, gamma, np.flatnonzero(np.asarray(taking_part)), has_friction
+        ),
     )
 
 
 class _ReducedImpact(NamedTuple):
-    """A law on a scene of which contacts are left out, at v- (n,), with the norm of errors."""
+    """A law on a scene of which contacts are left out, at v- (n,), with the norm of
+    errors.
+    """
 
     law: Law
     scene: Scene
@@ -206,46 +246,62 @@ class _ReducedImpact(NamedTuple):
     def without(self, left_out: Any) -> Scene:
         """The scene with an infinite gap at the contacts of these indices."""
         gaps = self.gaps([left_out])[0]
-        return with_gaps(self.scene, jnp.asarray(gaps)) if len(left_out) else self.scene
+        if len(left_out):
+            return with_gaps(self.scene, jnp.asarray(gaps))
+        return self.scene
 
     def gaps(self, left_out: Sequence[Any]) -> np.ndarray:
-        """Gaps (r, m) [m], infinite in row i at the contacts `left_out[i]` (indices)."""
+        """Gaps (r, m) [m], infinite in row i at the contacts `left_out[i]`
+        (indices).
+        """
         scene = self.scene
-        own = np.zeros(scene.contacts) if scene.gaps is None else np.asarray(scene.gaps)
+        if scene.gaps is None:
+            own = np.zeros(scene.contacts)
+        else:
+            own = np.asarray(scene.gaps)
         gaps = np.tile(own.astype(scene.mass.dtype), (len(left_out), 1))
         for row, index in zip(gaps, left_out):
             row[list(index)] = np.inf
         return gaps
 
     def run(self, left_out: Sequence[Any]) -> Outcomes:
-        """Outcomes (r,) of the impact without each set of contacts in `left_out`, in batches."""
+        """Outcomes (r,) of the impact without each set of contacts in `left_out`, in
+        batches.
+        """
         m = self.scene.contacts
         lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
         run = partial(varied_impacts, self.law, self.scene, self.velocity)
         return in_batches(run, {"gaps": self.gaps(left_out)}, lanes)
 
     def changes(self, left_out: Sequence[Any], reference: Outcomes) -> np.ndarray:
-        """Changes (r, n) of v+ from that of the whole scene; NaN where the law fails."""
+        """Changes (r, n) of v+ from that of the whole scene; NaN where the law
+        fails.
+        """
         return self.run(left_out).where_usable().velocity - reference.velocity[0]
 
 
 def _simplest_friction(
     trial: _ReducedImpact, reference: Outcomes, tolerance: float
 ) -> tuple[dict[str, float], _ReducedImpact]:
-    """Errors of v+ by way to treat friction, and the simplest way that is within tolerance.
+    """Errors of v+ by way to treat friction, and the simplest way that is within
+    tolerance.
 
     Ways are 'none', and 'one direction' of the tangents at each contact in space.
     """
-    law, scene = trial.law, trial.scene
+    law = trial.law
+    scene = trial.scene
     if getattr(law, "friction", None) is None or scene.tangents is None:
         return {}, trial
-    fields = [name for name in ("friction", "tangential_stiffness") if hasattr(law, name)]
+    fields = [
+        name for name in ("friction", "tangential_stiffness") if hasattr(law, name)
+    ]
     simpler: Any = replace(law, **dict.fromkeys(fields))
     ways = {"none": trial._replace(law=simpler, scene=_with_tangents(scene, None))}
     if scene.tangents.shape[1] == 2 * scene.contacts:
         along = _with_tangents(scene, _tangents_along_impulses(scene, reference))
         ways["one direction"] = trial._replace(scene=along)
-    errors, chosen = {}, None
+    errors = {}
+    chosen = None
     for name, way in ways.items():
         errors[name] = float(trial.norm(way.changes([()], reference))[0])
         if chosen is None and errors[name] <= tolerance:
@@ -261,15 +317,19 @@ def _with_tangents(scene: Scene, tangents: jax.Array | None) -> Scene:
 def _tangents_along_impulses(scene: Scene, reference: Outcomes) -> jax.Array:
     """One tangent (n, m) for each contact in space, along its tangential impulse.
 
-    Equation: `T_j d_j`, T_j (n, 2) the tangents of contact j, `d_j = p_t,j / |p_t,j|` (2,), the
-    first tangent where p_t,j = 0.
+    Equation: `T_j d_j`, T_j (n, 2) the tangents of contact j, `d_j = p_t,j / |p_t,j|`
+    (2,), the first tangent where p_t,j = 0.
     """
     m = scene.contacts
     impulse = reference.tangential[0].reshape(m, 2)
     size = np.linalg.norm(impulse, axis=1, keepdims=True)
-    direction = np.where(size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]])
+    direction = np.where(
+        size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]]
+    )
     tangents = np.asarray(scene.tangents).reshape(-1, m, 2)
-    return jnp.asarray(np.sum(tangents * direction[None], axis=2).astype(tangents.dtype))
+    return jnp.asarray(
+        np.sum(tangents * direction[None], axis=2).astype(tangents.dtype)
+    )
 
 
 def _effect_of_each_contact(
@@ -277,17 +337,20 @@ def _effect_of_each_contact(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Effect of leaving out each contact by itself.
 
-    Returns the indices of contacts with an impulse, and for all m contacts the error of v+ in the
-    energy norm over that of v- and the largest change of a velocity [m/s, rad/s]. Both are 0 for a
-    contact without impulse, and NaN beyond the first `runs` contacts with the largest
+    Returns the indices of contacts with an impulse, and for all m contacts the error of
+    v+ in the energy norm over that of v- and the largest change of a velocity [m/s,
+    rad/s]. Both are 0 for a contact without impulse, and NaN beyond the first `runs`
+    contacts with the largest
     `p_j sqrt(W_jj)`.
     """
-    reference, norm = trial.run([()]), trial.norm
+    reference = trial.run([()])
+    norm = trial.norm
     p = np.abs(reference.impulse[0])
     working = np.flatnonzero(p)
     weight = p * np.sqrt(np.asarray(diagonal(delassus_matrix(trial.scene))))
     largest = working[np.argsort(-weight[working], kind="stable")][:runs]
-    errors, changes = np.zeros(len(p)), np.zeros(len(p))
+    errors = np.zeros(len(p))
+    changes = np.zeros(len(p))
     errors[working] = changes[working] = np.nan
     if len(largest):
         change = trial.changes([(j,) for j in largest], reference)
@@ -306,9 +369,10 @@ def _sufficient_contacts(
 ) -> tuple[np.ndarray, float]:
     """Indices of contacts that suffice for v+ within `tolerance`, and the error of v+.
 
-    Greedy: the contacts `working` with an impulse are sorted by their `errors`, unknown ones (with
-    less impulse) first. As many of the first as possible are left out together, the next is kept,
-    and so on with those after it, for at most `runs` impacts.
+    Greedy: the contacts `working` with an impulse are sorted by their `errors`, unknown
+    ones (with less impulse) first. As many of the first as possible are left out
+    together, the next is kept, and so on with those after it, for at most `runs`
+    impacts.
     """
     order = working[np.argsort(np.nan_to_num(errors[working], nan=-1.0), kind="stable")]
     left_out = np.flatnonzero(~np.isin(np.arange(len(errors)), working)).tolist()
@@ -316,14 +380,24 @@ def _sufficient_contacts(
     waiting = order.tolist()
     while True:
         last = max(len(waiting) - (not kept), 0)  # one is always kept
-        # numbers of waiting contacts to leave out, all from 0 to `last` if `runs` allows it
+        # numbers of waiting contacts to leave out, all from 0 to `last` if `runs`
+        # allows it
         counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
         error = trial.norm(trial.changes(sets, reference))
         suffice = np.flatnonzero(error <= tolerance)
-        best = int(suffice[-1]) if len(suffice) else 0
-        left_out, left = sets[best], waiting[counts[best] :]
-        needed = counts[best + 1] - counts[best] if best + 1 < len(counts) else 1
-        kept, waiting, runs = kept + left[:needed], left[needed:], runs - last
+        if len(suffice):
+            best = int(suffice[-1])
+        else:
+            best = 0
+        left_out = sets[best]
+        left = waiting[counts[best] :]
+        if best + 1 < len(counts):
+            needed = counts[best + 1] - counts[best]
+        else:
+            needed = 1
+        kept = kept + left[:needed]
+        waiting = left[needed:]
+        runs = runs - last
         if runs <= 0 or not waiting:
             return np.sort(np.array(kept + waiting, dtype=int)), float(error[best])

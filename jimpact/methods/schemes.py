@@ -1,23 +1,29 @@
-"""Ways to integrate the LZB impact: jimpact's own, plain fixed steps, solvers of diffrax and scipy.
+"""Ways to integrate the LZB impact: jimpact's own, plain fixed steps, solvers of
+diffrax and scipy.
 
-All but the first work on the dimensionless flow of `events/contact_flow.py` in time form, with
-c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2:
+All but the first work on the dimensionless flow of `events/contact_flow.py` in time
+form, with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j
++ 1) / 2:
 
     x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j
     gamma = gamma- + G p + K_nt p_t,   u = u- + K_tn p + K_tt p_t
-    p_t,j' = -mu_j F_j u_j / sqrt(|u_j|^2 + s_j^2)        (friction, regularized below a slip s)
+    p_t,j' = -mu_j F_j u_j / sqrt(|u_j|^2 + s_j^2)        (friction, regularized below a
+    slip s)
 
-None of them looks for events: x_j is only clamped at 0, or the step-size control has to find the
-changes of phase. A change of phase within a fixed step costs O(step^2), whatever the order of the
-formula. Explicit steps are stable while `step * sqrt(lambda) < 2.83` (Runge-Kutta 4) or 2 (Verlet)
-with lambda the largest eigenvalue of `omega G omega c` (exponent 1): small e is stiff.
+None of them looks for events: x_j is only clamped at 0, or the step-size control has to
+find the changes of phase. A change of phase within a fixed step costs O(step^2),
+whatever the order of the formula. Explicit steps are stable while
+`step * sqrt(lambda) < 2.83` (Runge-Kutta 4) or 2 (Verlet) with lambda the largest
+eigenvalue of `omega G omega c` (exponent 1): small e is stiff.
 
-The published scheme steps in the impulse of the primary contact i, that with the largest force:
+The published scheme steps in the impulse of the primary contact i, that with the
+largest force:
 
     dp_j = F_j / F_i dp_i,   dE_j = -c_j gamma_j dp_j
 
-First order in the step; at E_j = 0 the rule is 0/0, and the implicit first step of a contact that
-is touched for the first time has a closed form. It has no time, so the duration is NaN.
+First order in the step; at E_j = 0 the rule is 0/0, and the implicit first step of a
+contact that is touched for the first time has a closed form. It has no time, so the
+duration is NaN.
 """
 
 import dataclasses
@@ -49,8 +55,8 @@ if TYPE_CHECKING:
 else:  # what impacts do without
     diffrax = needed("diffrax", "pip install diffrax")
 
-# Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
-# Ten times more would unload contacts that still push.
+# Part of the largest energy below which that of a contact is rounding, and the contact
+# unloaded. Ten times more would unload contacts that still push.
 EMPTY = 1e-14
 FINEST = 100 * float(np.finfo(float).eps)  # scipy takes no smaller rtol
 GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an opening
@@ -60,25 +66,34 @@ FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts abou
 Solve = Callable[[LZB, Scene, Any, Any], Solution]
 
 
-_FORCES_A_STEP = 3  # normal forces that an implicit step asks for: a whole one and two halves
+# normal forces that an implicit step asks for: a whole one and two halves
+_FORCES_A_STEP = 3
 
 
 class Scaled(NamedTuple):
-    """Dimensionless impact of closed contacts; a placeholder if nothing `happens` ()."""
+    """Dimensionless impact of closed contacts; a placeholder if nothing `happens`
+    ().
+    """
 
     dynamics: Dynamics
     happens: jax.Array
 
-    def solution(self, p: Any, t: Any, evaluations: Any, code: Any, p_t: Any) -> Solution:
+    def solution(
+        self, p: Any, t: Any, evaluations: Any, code: Any, p_t: Any
+    ) -> Solution:
         """Solution in SI units of dimensionless p (m,), duration t (), p_t (t,).
 
-        Impulses are 0 if nothing happens; the status is `not_finite` if an impulse is not finite.
+        Impulses are 0 if nothing happens; the status is `not_finite` if an impulse is
+        not finite.
         """
-        units, tangential = self.dynamics.units, None
+        units = self.dynamics.units
+        tangential = None
         impulse = jnp.where(self.happens, p * units.momentum, 0.0)
         finite = jnp.all(jnp.isfinite(impulse))
         if self.dynamics.problem.tangential is not None:
-            tangential = jnp.where(self.happens, p_t * per_tangent(units.momentum, p_t), 0.0)
+            tangential = jnp.where(
+                self.happens, p_t * per_tangent(units.momentum, p_t), 0.0
+            )
             finite = finite & jnp.all(jnp.isfinite(tangential))
         code = jnp.where(self.happens, code, CODE["ok"])
         return Solution(
@@ -91,11 +106,14 @@ class Scaled(NamedTuple):
 
 
 def scaled(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Scaled:
-    """Dimensionless form of an impact of closed contacts at v- (n,), to be solved to `rtol`."""
+    """Dimensionless form of an impact of closed contacts at v- (n,), to be solved to
+    `rtol`.
+    """
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
     contact = law.contact(scene, v)
-    gamma, happens = contact.gap_velocity, contact.happens
+    gamma = contact.gap_velocity
+    happens = contact.happens
     # any approach will do for the placeholder, if its numbers are finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
@@ -105,22 +123,28 @@ def scaled(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Scaled:
 def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
     """Time [s] that 'step' settings are parts of: that of the fastest contact alone.
 
-    Equation: `min_j x_ref,j / (Q sqrt(W_jj))` (see `events/impact_dynamics.py`); a contact alone
-    with exponent 1 and e = 1 lasts pi of its own.
+    Equation: `min_j x_ref,j / (Q sqrt(W_jj))` (see `events/impact_dynamics.py`); a
+    contact alone with exponent 1 and e = 1 lasts pi of its own.
 
     >>> import jimpact as ji
     >>> from jimpact.methods.schemes import time_scale
-    >>> float(time_scale(ji.LZB(1.0, 4.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]))
+    >>> float(
+    ...     time_scale(
+    ...         ji.LZB(1.0, 4.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]
+    ...     )
+    ... )
     0.5
     """
     return scaled(law, scene, velocity).dynamics.units.time
 
 
-# ------------------------------------------------------------------------------ the field
+# ------------------------------------------------------------------------------ the
+# field
 
 
 class Field(NamedTuple):
-    """Right-hand sides of the dimensionless flow in time (module docstring); JAX or NumPy arrays.
+    """Right-hand sides of the dimensionless flow in time (module docstring); JAX or
+    NumPy arrays.
 
     In its methods x (m,) are indentations, p (m,) and p_t (t,) impulses.
     """
@@ -146,7 +170,9 @@ class Field(NamedTuple):
         return self.gamma + self.coupling @ p + self.cross @ p_t
 
     def closing(self, now: Any) -> Any:
-        """`x' = -omega c gamma` (m,) at gap velocities `now`; c = 1, or 1/e^2 where they open."""
+        """`x' = -omega c gamma` (m,) at gap velocities `now`; c = 1, or 1/e^2 where
+        they open.
+        """
         return -self.omega * _where(now > 0, 1 / self.restitution**2, 1.0) * now
 
     def force(self, x: Any) -> Any:
@@ -154,7 +180,12 @@ class Field(NamedTuple):
         if isinstance(x, np.ndarray):
             eta = np.asarray(self.exponent, float)
             return (eta + 1) / 2 * self.omega * np.maximum(x, 0.0) ** eta
-        return (jnp.asarray(self.exponent, x.dtype) + 1) / 2 * self.omega * power(x, self.exponent)
+        return (
+            (jnp.asarray(self.exponent, x.dtype) + 1)
+            / 2
+            * self.omega
+            * power(x, self.exponent)
+        )
 
     def drag(self, force: Any, p: Any, p_t: Any, slow: Any) -> Any:
         """`p_t' = -mu F u / sqrt(|u|^2 + slow^2)` (t,) of normal forces F (m,).
@@ -168,8 +199,11 @@ class Field(NamedTuple):
         return -(_where(moves, drag, 0.0)[:, None] * u).ravel()
 
     def rates(self, x: Any, p: Any, p_t: Any, slow: Any) -> tuple[Any, Any, Any]:
-        """(x', p', p_t'); an open contact stays at its x <= 0, as solvers cannot clamp."""
-        closing, force = self.closing(self.gap_velocity(p, p_t)), self.force(x)
+        """(x', p', p_t'); an open contact stays at its x <= 0, as solvers cannot
+        clamp.
+        """
+        closing = self.closing(self.gap_velocity(p, p_t))
+        force = self.force(x)
         opened = (x <= 0) & (closing < 0)
         return _where(opened, 0.0, closing), force, self.drag(force, p, p_t, slow)
 
@@ -185,20 +219,31 @@ def _where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def field_of(problem: Scaled) -> Field:
-    """Right-hand sides of a dimensionless impact; G as sparse as its contacts are coupled."""
-    dynamics, inputs = problem.dynamics, problem.dynamics.problem
-    m, off, one = len(inputs.gamma), inputs.off_diagonal, jnp.ones_like(inputs.gamma)
+    """Right-hand sides of a dimensionless impact; G as sparse as its contacts are
+    coupled.
+    """
+    dynamics = problem.dynamics
+    inputs = problem.dynamics.problem
+    m = len(inputs.gamma)
+    off = inputs.off_diagonal
+    one = jnp.ones_like(inputs.gamma)
     coupling: Any = Tridiagonal(one, off)
     if isinstance(dynamics.structure, Neighbours):
         coupling = Sparse(one, off, dynamics.structure)
-    elif dynamics.structure is None:  # dense; its diagonal is 1, `off` the upper triangle by rows
+    # dense; its diagonal is 1, `off` the upper triangle by rows
+    elif dynamics.structure is None:
         upper = jnp.zeros((m, m), off.dtype).at[jnp.triu_indices(m, 1)].set(off)
         coupling = unit(upper) + upper + upper.T
     none = jnp.zeros((m, 0), off.dtype)
-    cross, tangent, slip, friction = none, none[:0], none[0], jnp.zeros_like(one)
+    cross = none
+    tangent = none[:0]
+    slip = none[0]
+    friction = jnp.zeros_like(one)
     if inputs.tangential is not None:
         block, friction, _ = inputs.tangential
-        cross, tangent, slip = block.normal_tangent, block.tangent, block.slip
+        cross = block.normal_tangent
+        tangent = block.tangent
+        slip = block.slip
     eta: Any = dynamics.static_exponent if inputs.exponent is None else inputs.exponent
     return Field(
         first_indentation(inputs, dynamics.static_exponent),
@@ -207,18 +252,22 @@ def field_of(problem: Scaled) -> Field:
     )
 
 
-# --------------------------------------------------------------------------- jimpact's own
+# --------------------------------------------------------------------------- jimpact's
+# own
 
 
 def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-    """Event-aligned steps, as in `impact`: none straddles a change of phase; `setting` is the rtol.
+    """Event-aligned steps, as in `impact`: none straddles a change of phase; `setting`
+    is the rtol.
 
-    Impulses are of the run that ends an isolated contact in closed form; the duration takes a
-    second run, without it (which the compiler leaves out where the duration is not used).
+    Impulses are of the run that ends an isolated contact in closed form; the duration
+    takes a second run, without it (which the compiler leaves out where the duration is
+    not used).
     """
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="time")
-    program, leaves = dynamics.program(), dynamics.columns()[0]
+    program = dynamics.program()
+    leaves = dynamics.columns()[0]
     p, p_t, _, code, passes = evaluate(program, leaves)
     _, _, t, _, _ = evaluate(dataclasses.replace(program, with_end_time=True), leaves)
     evaluations = (STAGES + 1) * passes[0, 0]  # of all passes, rejected ones included
@@ -234,7 +283,8 @@ def implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], p_t[:, 0])
 
 
-# ---------------------------------------------------------------------------- fixed steps
+# ---------------------------------------------------------------------------- fixed
+# steps
 
 
 class Walk(NamedTuple):
@@ -262,7 +312,8 @@ class StepEnd(NamedTuple):
     force: jax.Array
 
 
-Step = Callable[[Field, jax.Array, Walk], StepEnd]  # of the field, the step size h, the state
+# of the field, the step size h, the state
+Step = Callable[[Field, jax.Array, Walk], StepEnd]
 
 
 State = TypeVar("State", Walk, "ImpulseWalk")
@@ -273,18 +324,22 @@ def until_over(
 ) -> tuple[State, jax.Array]:
     """Last state of an integration that advances while it is `at_work`, and its status.
 
-    `walk` is the first state, a `Walk` or `ImpulseWalk`; after `most` steps the status is
-    `max_steps`.
+    `walk` is the first state, a `Walk` or `ImpulseWalk`; after `most` steps the status
+    is `max_steps`.
     """
     end = jax.lax.while_loop(lambda x: x.at_work & (x.steps < most), advance, walk)
     return end, jnp.where(end.at_work, CODE["max_steps"], CODE["ok"])
 
 
 def in_time(step: Step, stages: int) -> Solve:
-    """Solver with fixed time steps of `stages` evaluations each; the setting is their size."""
+    """Solver with fixed time steps of `stages` evaluations each; the setting is their
+    size.
+    """
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-        """Impulses at v- (n,) with time steps of `setting`, in units of `time_scale`."""
+        """Impulses at v- (n,) with time steps of `setting`, in units of
+        `time_scale`.
+        """
         problem = scaled(law, scene, velocity)
         field = field_of(problem)
         h = jnp.asarray(setting, field.gamma.dtype)
@@ -295,7 +350,9 @@ def in_time(step: Step, stages: int) -> Solve:
             gamma = field.gap_velocity(p, p_t)
             return Walk(jnp.maximum(x, 0.0), p, p_t, gamma, force, walk.steps + 1)
 
-        first = Walk(*field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32))
+        first = Walk(
+            *field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32)
+        )
         end, code = until_over(advance, first, problem.dynamics.max_steps)
         time = h * end.steps.astype(h.dtype)
         return problem.solution(end.p, time, stages * end.steps, code, end.p_t)
@@ -304,7 +361,9 @@ def in_time(step: Step, stages: int) -> Solve:
 
 
 def rk4(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
-    """A classical Runge-Kutta step h of `x' = -omega c gamma(p)`, `p' = F(x)`, without friction."""
+    """A classical Runge-Kutta step h of `x' = -omega c gamma(p)`, `p' = F(x)`, without
+    friction.
+    """
     start = walk.x, walk.p
     rates = total = jax.tree.map(jnp.zeros_like, start)
     for node, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
@@ -316,11 +375,12 @@ def rk4(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
 
 
 def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
-    """A step h of velocity Verlet: half a kick `p += h/2 F(x)`, `x += h x'(p)`, half a kick.
+    """A step h of velocity Verlet: half a kick `p += h/2 F(x)`, `x += h x'(p)`, half a
+    kick.
 
-    Friction acts in both half kicks. It is regularized below the slip that it stops within one of
-    them, `mu F h/2 |K_tt|` with the largest absolute row sum: stable for whatever step; contacts
-    that should stick creep by O(step).
+    Friction acts in both half kicks. It is regularized below the slip that it stops
+    within one of them, `mu F h/2 |K_tt|` with the largest absolute row sum: stable for
+    whatever step; contacts that should stick creep by O(step).
     """
     stiffest = jnp.max(jnp.sum(jnp.abs(field.tangent), axis=1), initial=0.0)
 
@@ -337,7 +397,8 @@ def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
     return StepEnd(x, p, dragged(force, p, p_t), force)
 
 
-# ------------------------------------------------------------- steps in impulse (published)
+# ------------------------------------------------------------- steps in impulse
+# (published)
 
 
 class ImpulseWalk(NamedTuple):
@@ -360,8 +421,10 @@ def impulse_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Soluti
     The setting is their size, in units of the impact's momentum.
     """
     problem = scaled(law, scene, velocity, setting)
-    inputs, field = problem.dynamics.problem, field_of(problem)
-    none, zero = jnp.zeros_like(inputs.gamma), jnp.zeros((), jnp.int32)
+    inputs = problem.dynamics.problem
+    field = field_of(problem)
+    none = jnp.zeros_like(inputs.gamma)
+    zero = jnp.zeros((), jnp.int32)
     first = ImpulseWalk(inputs.gamma, 0.5 * inputs.energy, none, zero)
     advance = partial(_impulse_step, field, inputs.step[0])
     end, code = until_over(advance, first, problem.dynamics.max_steps)
@@ -369,20 +432,25 @@ def impulse_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Soluti
 
 
 def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk:
-    """One explicit step of `dp` in the impulse of the primary contact i, that of the largest force.
+    """One explicit step of `dp` in the impulse of the primary contact i, that of the
+    largest force.
 
-    Equation: `dp_j = F_j / F_i dp`, `F_j(E) = (eta + 1) / 2 omega (2 E)^(eta / (eta + 1))`, and
-    `E_j` falls by the work of dp_j, `c_j gamma_j dp_j`. A contact with E_j = 0 that approaches at
-    w_j has `E_j = w_j dp_j` in this step, so that `dp_j = ((dp / F_i) F_j(w_j))^(eta + 1)`.
+    Equation: `dp_j = F_j / F_i dp`, `F_j(E) = (eta + 1) / 2 omega (2 E)^(eta / (eta +
+    1))`, and `E_j` falls by the work of dp_j, `c_j gamma_j dp_j`. A contact with E_j =
+    0 that approaches at w_j has `E_j = w_j dp_j` in this step, so that
+    `dp_j = ((dp / F_i) F_j(w_j))^(eta + 1)`.
     """
-    gamma, energy = walk.gamma, walk.energy
+    gamma = walk.gamma
+    energy = walk.energy
     eta = jnp.asarray(field.exponent, gamma.dtype)
     approach = jnp.maximum(-gamma, 0.0)
 
     def force(energy: jax.Array) -> jax.Array:
         """Dimensionless contact force at potential energy E_j."""
         positive = energy > 0
-        root = jnp.where(positive, jnp.where(positive, 2 * energy, 1.0) ** (eta / (eta + 1)), 0.0)
+        root = jnp.where(
+            positive, jnp.where(positive, 2 * energy, 1.0) ** (eta / (eta + 1)), 0.0
+        )
         return (eta + 1) / 2 * field.omega * root
 
     # at the first touch the energy is that of the step itself
@@ -396,7 +464,8 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
     increment = jnp.where(is_primary, dp, increment)
     increment = increment * _emptying(field, walk, is_primary, increment)
     after = gamma + field.coupling @ increment
-    # exact work of the step; its error is the first-order one of the distributing rule alone
+    # exact work of the step; its error is the first-order one of the distributing rule
+    # alone
     middle = 0.5 * (gamma + after)
     rate = jnp.where(middle > 0, 1 / field.restitution**2, 1.0)
     left = jnp.maximum(energy - rate * middle * increment, 0.0)
@@ -407,34 +476,50 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
 def _emptying(
     field: Field, walk: ImpulseWalk, is_primary: jax.Array, increment: jax.Array
 ) -> jax.Array:
-    """Fraction s () of the step at which the primary contact is unloaded; 1 if it is not.
+    """Fraction s () of the step at which the primary contact is unloaded; 1 if it is
+    not.
 
-    Equation: `gamma s + dgamma s^2 / 2 = b`, `b = E e^2 / dp`, dgamma the change of its gap
-    velocity in the whole step: `s = 2 b / (gamma + sqrt(gamma^2 + 2 dgamma b))`. The derivative of
-    the outcome depends on ending there, not on a fixed step.
+    Equation: `gamma s + dgamma s^2 / 2 = b`, `b = E e^2 / dp`, dgamma the change of its
+    gap velocity in the whole step: `s = 2 b / (gamma + sqrt(gamma^2 + 2 dgamma b))`.
+    The derivative of the outcome depends on ending there, not on a fixed step.
     """
-    values = walk.gamma, walk.energy, increment, field.coupling @ increment, field.restitution
+    values = (
+        walk.gamma,
+        walk.energy,
+        increment,
+        field.coupling @ increment,
+        field.restitution,
+    )
     # of the primary contact alone
-    gamma, energy, dp, dgamma, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
+    gamma, energy, dp, dgamma, e = (
+        jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values
+    )
     b = energy * e**2 / dp
     expands = (gamma + 0.5 * dgamma > 0) & (energy > 0)
-    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * dgamma * b, 1.0), 0.0))
+    root = jnp.sqrt(
+        jnp.maximum(jnp.where(expands, gamma**2 + 2 * dgamma * b, 1.0), 0.0)
+    )
     denominator = jnp.where(expands, gamma + root, 1.0)
     fraction = 2 * b / jnp.where(denominator > 0, denominator, 1.0)
     return jnp.where(expands & (denominator > 0) & (fraction < 1), fraction, 1.0)
 
 
-# ------------------------------------------------------------------------------- libraries
+# -------------------------------------------------------------------------------
+# libraries
 
 
 def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
-    """Solver by diffrax, ended by an event; `stages`: evaluations a step (None: not known)."""
+    """Solver by diffrax, ended by an event; `stages`: evaluations a step (None: not
+    known).
+    """
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-        """Impulses at v- (n,) with rtol `setting`, to the end of the step in which it is over.
+        """Impulses at v- (n,) with rtol `setting`, to the end of the step in which it
+        is over.
 
-        That changes no impulse, but the duration is not known. The event `max(x, -gamma) = rtol`
-        must be crossed downwards: the impact begins at the approach itself.
+        That changes no impulse, but the duration is not known. The event
+        `max(x, -gamma) = rtol` must be crossed downwards: the impact begins at the
+        approach itself.
         """
         problem = scaled(law, scene, velocity)
         field = field_of(problem)
@@ -450,7 +535,8 @@ def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
             args=(field, rtol),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
             event=diffrax.Event(
-                lambda t, y, args, **_: args[0].at_work(*y, none) - args[1], direction=False
+                lambda t, y, args, **_: args[0].at_work(*y, none) - args[1],
+                direction=False,
             ),
             adjoint=diffrax.ForwardMode(),
             max_steps=problem.dynamics.max_steps,
@@ -458,7 +544,10 @@ def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
         )
         assert result.ys is not None
         steps = result.stats["num_steps"]
-        evaluations = jnp.full_like(steps, UNCOUNTED) if stages is None else stages * steps + 1
+        if stages is None:
+            evaluations = jnp.full_like(steps, UNCOUNTED)
+        else:
+            evaluations = stages * steps + 1
         ended = result.result == diffrax.RESULTS.event_occurred
         code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
         return problem.solution(result.ys[1][-1], jnp.nan, evaluations, code, none)
@@ -474,27 +563,36 @@ def by_scipy(name: str) -> Solve:
     """Solver by the method `name` of `scipy.integrate.solve_ivp`, ended by an event."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-        """Impulses at v- (n,) with rtol `setting`, also the slip that regularizes friction."""
+        """Impulses at v- (n,) with rtol `setting`, also the slip that regularizes
+        friction.
+        """
         from scipy.integrate import solve_ivp  # late: scipy is slow to import
 
         problem, traced = _on_host(law, scene, velocity)
         field = Field(*(np.asarray(x, float) for x in traced))
         m = len(field.gamma)
-        parts, rtol = np.cumsum([m, m]), max(float(setting), FINEST)
+        parts = np.cumsum([m, m])
+        rtol = max(float(setting), FINEST)
         most = min(problem.dynamics.max_steps, GIVE_UP * m)
-        count, reached = 0, (0.0, np.concatenate(field.start))
+        count = 0
+        reached = (0.0, np.concatenate(field.start))
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
-            """Rates of (x, p, p_t) (2 m + t,); counted, as `nfev` omits the solver's Jacobians."""
+            """Rates of (x, p, p_t) (2 m + t,); counted, as `nfev` omits the solver's
+            Jacobians.
+            """
             nonlocal count, reached
-            count, reached = count + 1, (t, y)
+            count = count + 1
+            reached = (t, y)
             if count > most:
                 raise _GaveUpError
             x, p, p_t = np.split(y, parts)
             return np.concatenate(field.rates(x, p, p_t, rtol))
 
         def at_work(_: float, y: np.ndarray) -> float:
-            """Event function `max(x, -gamma) - rtol`: positive while the impact lasts."""
+            """Event function `max(x, -gamma) - rtol`: positive while the impact
+            lasts.
+            """
             x, p, p_t = np.split(y, parts)
             return field.at_work(x, p, p_t) - rtol
 
@@ -505,7 +603,8 @@ def by_scipy(name: str) -> Solve:
         except _GaveUpError:
             ended = False
         else:
-            ended, reached = result.status == 1, (float(result.t[-1]), result.y[:, -1])
+            ended = result.status == 1
+            reached = (float(result.t[-1]), result.y[:, -1])
         time, y = reached
         _, p, p_t = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
         code = CODE["ok" if ended else "max_steps"]
@@ -516,7 +615,9 @@ def by_scipy(name: str) -> Solve:
 
 @precise_jit
 def _on_host(law: LZB, scene: Scene, velocity: Any) -> tuple[Scaled, Field]:
-    """Dimensionless form of an impact, and its right-hand sides with a dense G, for NumPy."""
+    """Dimensionless form of an impact, and its right-hand sides with a dense G, for
+    NumPy.
+    """
     problem = scaled(law, scene, velocity)
     field = field_of(problem)
     return problem, field._replace(coupling=as_matrix(field.coupling))

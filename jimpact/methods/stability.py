@@ -1,16 +1,19 @@
 """`stability_map`: where a method of integration is right, flagged, wrong, or worse.
 
 # notation: a point is a row (7,) of AXES
-#   setting           0 coarse .. 1 fine, log-linear in what the method takes (`setting_of`)
-#   stiffness_ratio   kappa: stiffness of the right half of the contacts; the left half has 1
+#   setting           0 coarse .. 1 fine, log-linear in what the method takes
+(`setting_of`)
+#   stiffness_ratio   kappa: stiffness of the right half of the contacts; the left half
+has 1
 #   exponent          eta of all contacts
 #   restitution       e of all contacts
 #   mass_ratio        mu: mass of the middle ball; all others have 1
 #   balls             N, a touching chain without walls; v- = (1, 0, .., 0)
-#   friction          mu of all contacts of a given scene, which has no mass_ratio and no balls
+#   friction          mu of all contacts of a given scene, which has no mass_ratio and
+no balls
 
-One function is compiled for each method and number of balls; it runs on batches of points, which
-wait for their slowest point, so the number of steps is bounded.
+One function is compiled for each method and number of balls; it runs on batches of
+points, which wait for their slowest point, so the number of steps is bounded.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,8 +30,20 @@ from jimpact.core.audits import audit
 from jimpact.core.scene import Scene, as_velocity, chain
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contenders_of, solved
-from jimpact.methods.points import Outcomes, at_points, in_batches, left_out_notes, relative_error
-from jimpact.tools.checks import as_axis, as_whole, check_choice, check_kind, check_values
+from jimpact.methods.points import (
+    Outcomes,
+    at_points,
+    in_batches,
+    left_out_notes,
+    relative_error,
+)
+from jimpact.tools.checks import (
+    as_axis,
+    as_whole,
+    check_choice,
+    check_kind,
+    check_values,
+)
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.progress import counting_bar
 from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data
@@ -36,7 +51,8 @@ from jimpact.tools.status import CODE
 
 BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
 # Each number of balls is compiled by itself: below this resolution only a few.
-_FEW_BALLS, _FEW = (2, 3, 10), 8
+_FEW_BALLS = (2, 3, 10)
+_FEW = 8
 
 
 class Axis(NamedTuple):
@@ -51,10 +67,15 @@ class Axis(NamedTuple):
     least: float = 0.0
 
     def values(self, count: int) -> np.ndarray:
-        """`count` values from `low` to `high`: evenly spaced, or geometric if `least` > 0."""
+        """`count` values from `low` to `high`: evenly spaced, or geometric if `least` >
+        0.
+        """
         if not self.least:
             return np.linspace(self.low, self.high, count)
-        zero = [] if self.low else [0.0]
+        if self.low:
+            zero = []
+        else:
+            zero = [0.0]
         return np.append(zero, np.geomspace(self.least, self.high, count - len(zero)))
 
 
@@ -68,29 +89,41 @@ _AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse s
     "friction": Axis(0.3, 0.0, 10.0, 0.03),
 }
 AXES = tuple(_AXES)
-# kind of setting (see `jimpact.methods.contenders.Contender`): value at level 0 and at level 1
+# kind of setting (see `jimpact.methods.contenders.Contender`): value at level 0 and at
+# level 1
 SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
 
 (RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
-CLASSES: tuple[str, ...] = ("right", "flagged", "wrong", "gains energy", "stalls", "does not end")
+CLASSES: tuple[str, ...] = (
+    "right",
+    "flagged",
+    "wrong",
+    "gains energy",
+    "stalls",
+    "does not end",
+)
 CLASSES += ("not finite", "unchecked")
 HONEST = 10.0  # a result is right up to this error over its rtol
-FIXED_STEP_RIGHT = 1e-3  # methods with a step: right up to this error of v+ over the largest |v-|
+# methods with a step: right up to this error of v+ over the largest |v-|
+FIXED_STEP_RIGHT = 1e-3
 FINER = 0.1  # a wrong result is tried again at this part of its setting,
 FALLS = 0.5  # and stalls unless its error falls below this part
 BATCH = 32  # points computed together
 
 REFERENCE_RTOL = 1e-12  # of the default method, the reference of all others
 CHECK_RTOL = 1e-11  # of the run by scipy,
-CHECK_STEPS = 100_000  # and the most evaluations that it may take; ten times more only waits longer
+# and the most evaluations that it may take; ten times more only waits longer
+CHECK_STEPS = 100_000
 CONFIRMED = 1e-7  # the reference is confirmed up to this difference of v+ from scipy's
 CHECKED = 12  # points solved by scipy, at most
-# The same two where contacts have friction: scipy regularizes it below a slip of the tolerance. Ten
-# times finer takes scipy many times longer where contacts stick.
-FRICTION_RTOL, FRICTION_CONFIRMED = 1e-8, 1e-6
-# scipy solves a point soon up to this ratio of frequencies, to the slowest contact's, and number
-# of balls.
-QUICK_RATIO, QUICK_BALLS = 1e3, 10
+# The same two where contacts have friction: scipy regularizes it below a slip of the
+# tolerance. Ten times finer takes scipy many times longer where contacts stick.
+FRICTION_RTOL = 1e-8
+FRICTION_CONFIRMED = 1e-6
+# scipy solves a point soon up to this ratio of frequencies, to the slowest contact's,
+# and number of balls.
+QUICK_RATIO = 1e3
+QUICK_BALLS = 10
 
 RECLOSING = 0.1  # below this e three balls re-close (nearly) without end
 NAMES = ("time", "rk4", "verlet", "impulse_euler")
@@ -125,7 +158,8 @@ class StabilityMap(Tabular):
         axes: values along every axis.
         base: the point that the slices go through.
         slices: by method, first those over one axis, then pairs.
-        samples: Latin-hypercube points (S, 7), columns `jimpact.methods.stability.AXES`.
+        samples: Latin-hypercube points (S, 7), columns
+            `jimpact.methods.stability.AXES`.
         sampled: by method, a `Slice` over the samples.
         confirmation: of the reference, by an integrator that shares no code with it.
         max_steps: of every run.
@@ -145,15 +179,23 @@ class StabilityMap(Tabular):
     picture = "stability_map"
 
     def counts(self, method: str) -> dict[str, int]:
-        """Number of points in each class, over all slices and samples of a `method` (a name)."""
+        """Number of points in each class, over all slices and samples of a `method` (a
+        name).
+        """
         slices = *self.slices[method], self.sampled[method]
         codes = np.concatenate([each.codes.ravel() for each in slices])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
     def to_dict(self) -> dict[str, Any]:
-        """Axes, classes, errors and counts of classes by method, as a JSON file can hold them."""
+        """Axes, classes, errors and counts of classes by method, as a JSON file can
+        hold them.
+        """
         by_method = {
-            name: {"counts": self.counts(name), "slices": self.slices[name], "sampled": sampled}
+            name: {
+                "counts": self.counts(name),
+                "slices": self.slices[name],
+                "sampled": sampled,
+            }
             for name, sampled in self.sampled.items()
         }
         words = {"classes": CLASSES, "methods": by_method}
@@ -161,23 +203,37 @@ class StabilityMap(Tabular):
 
     @property
     def table(self) -> Table:
-        """Table: number of points in each class by method; docs/stability.md says why they fail."""
-        base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
-        checked, others = self.confirmation, ""
+        """Table: number of points in each class by method; docs/stability.md says why
+        they fail.
+        """
+        base = ", ".join(
+            f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items()
+        )
+        checked = self.confirmation
+        others = ""
         if checked.confirmed < checked.tried:
-            others = f"; v+ of the others differs by up to {checked.difference:.1g} of |v-|: scipy "
+            others = (
+                f"; v+ of the others differs by up to {checked.difference:.1g} "
+                f"of "
+                f"|v-|: scipy "
+            )
             others += "may end an impact too early (docs/stability.md)"
         head = [
             f"base: {base}; at most {self.max_steps:,} steps",
-            f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of {checked.tried} "
-            f"solved by scipy, too, {checked.confirmed} agree to {checked.within:g}{others}",
-            f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
+            f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of "
+            f"{checked.tried} "
+            f"solved by scipy, too, {checked.confirmed} agree to "
+            f"{checked.within:g}{others}",
+            f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for "
+            f"fixed steps, "
             "of the largest |v-|",
             "",
         ]
         counts = [Column(name, lambda count: str(count or "")) for name in CLASSES]
         rows = [[name, *self.counts(name).values()] for name in self.methods]
-        return Table([Column("method"), *counts], rows, head, left_out_notes(self.left_out))
+        return Table(
+            [Column("method"), *counts], rows, head, left_out_notes(self.left_out)
+        )
 
 
 @full_precision
@@ -195,25 +251,28 @@ def stability_map(
     seed: int = 0,
     progress: float | None = None,
 ) -> StabilityMap:
-    """Map of points where methods integrate the LZB law correctly, or fail, over six axes.
+    """Map of points where methods integrate the LZB law correctly, or fail.
 
-    A point is a chain of N touching balls of which the first strikes the others: kappa is the
-    stiffness ratio of its halves, mu the mass ratio of its middle ball (`chain_of`); and a
-    setting of the method. A `scene` takes the place of the chains: its axes are `setting`,
-    `stiffness_ratio` (two contacts and more), `exponent`, `restitution` and, with tangents,
-    `friction`. Classes: `right` (error in v+ within 10 rtol; 1e-3 for fixed steps, of
-    the largest |v-|), `flagged` (a failure status, or refused beforehand), `wrong` (silently),
-    `gains energy`, `stalls` (silently wrong, and a ten times finer setting does not halve the
-    error), `does not end` (in `max_steps`), `not finite`, `unchecked` (no reference ends).
+    A point is a chain of N touching balls of which the first strikes the others: kappa
+    is the stiffness ratio of its halves, mu the mass ratio of its middle ball
+    (`chain_of`); and a setting of the method. A `scene` takes the place of the chains:
+    its axes are `setting`, `stiffness_ratio` (two contacts and more), `exponent`,
+    `restitution` and, with tangents, `friction`. Classes: `right` (error in v+ within
+    10 rtol; 1e-3 for fixed steps, of
+    the largest |v-|), `flagged` (a failure status, or refused beforehand), `wrong`
+    (silently), `gains energy`, `stalls` (silently wrong, and a ten times finer setting
+    does not halve the error), `does not end` (in `max_steps`), `not finite`,
+    `unchecked` (no reference ends).
 
     Args:
-        methods: names in `jimpact.methods.contenders.CONTENDERS` that JAX can batch; None: 'time'
-            (what `impact` does), 'rk4', 'verlet' and 'impulse_euler'. With friction: those that
-            have it.
-        axes: values by name, of `setting` (0 coarse .. 1 fine), `stiffness_ratio` 1e-8..1e8,
-            `exponent` 1..5, `restitution` 0..1, `mass_ratio` 1e-6..1e6, `balls`, `friction` 0..10;
-            None: all.
-        base: point from which slices start, by name; default three equal Hertz balls, e = 0.9
+        methods: names in `jimpact.methods.contenders.CONTENDERS` that JAX can batch;
+            None: 'time' (what `impact` does), 'rk4', 'verlet' and 'impulse_euler'. With
+            friction: those that have it.
+        axes: values by name, of `setting` (0 coarse .. 1 fine), `stiffness_ratio`
+            1e-8..1e8, `exponent` 1..5, `restitution` 0..1, `mass_ratio` 1e-6..1e6,
+            `balls`, `friction` 0..10; None: all.
+        base: point from which slices start, by name; default three equal Hertz balls, e
+            = 0.9
             (of a scene: Hertz contacts of equal stiffness, e = 0.9, mu = 0.3).
         resolution: values along a default axis.
         slices: 'one' axis at a time, or 'pairs' of axes as well.
@@ -228,26 +287,33 @@ def stability_map(
         `StabilityMap`; in double precision (jax_enable_x64) only.
 
     Raises:
-        ValueError: unknown names, a known name for a contender of your own, values out of range,
-            single precision, a scene without a velocity, nothing approaches, methods without
-            friction for a scene that has it.
+        ValueError: unknown names, a known name for a contender of your own, values out
+            of range, single precision, a scene without a velocity, nothing approaches,
+            methods without friction for a scene that has it.
 
     Source: docs/stability.md.
 
     >>> import jimpact as ji
-    >>> result = ji.stability_map(["verlet"], {"setting": [0.0, 0.8]}, {"balls": 2, "exponent": 1})
+    >>> result = ji.stability_map(
+    ...     ["verlet"], {"setting": [0.0, 0.8]}, {"balls": 2, "exponent": 1}
+    ... )
     >>> result.counts("verlet")["right"]
     1
     """
     check_choice("slices", slices, SLICES)
-    samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
+    samples = as_whole("samples", samples, 0)
+    max_steps = as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
-        raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
+        raise ValueError(
+            "A stability map needs double precision: enable jax_enable_x64."
+        )
     setup = _checked_setup(scene, velocity)
     chosen = _methods(methods, setup)
     values = _axis_values(axes, as_whole("resolution", resolution, 2), setup.axes)
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {name: float(x) for name, x in _checked("base", base or {}, setup.axes).items()}
+    start |= {
+        name: float(x) for name, x in _checked("base", base or {}, setup.axes).items()
+    }
     axis_sets: list[tuple[str, ...]] = [(name,) for name in values]
     if slices == "pairs":
         axis_sets += list(combinations(values, 2))
@@ -258,10 +324,15 @@ def stability_map(
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
         exact, confirmation = references(points, setup, runners, advance)
-        classes = {m.name: partial(classes_of, m, setup, exact, runners, advance) for m in chosen}
+        classes = {
+            m.name: partial(classes_of, m, setup, exact, runners, advance)
+            for m in chosen
+        }
         classified, left_out = at_points(classes, points)
-    ends = np.cumsum([part[..., 0].size for part in parts])  # of slices among all points
-    by_slice, by_sample = {}, {}
+    # of slices among all points
+    ends = np.cumsum([part[..., 0].size for part in parts])
+    by_slice = {}
+    by_sample = {}
     for name, columns in classified.items():
         codes, errors = (np.split(column, ends) for column in columns)
         by_slice[name] = tuple(
@@ -283,7 +354,8 @@ def stability_map(
 
 
 class Setup(NamedTuple):
-    """Scene of all points at v- (n,), the largest |v-| 1; None: chains whose first ball strikes.
+    """Scene of all points at v- (n,), the largest |v-| 1; None: chains whose first ball
+    strikes.
 
     A point is a row (7,) of numbers in the order of `AXES`.
     """
@@ -298,78 +370,116 @@ class Setup(NamedTuple):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the axes that count: a scene has no masses and balls, a chain no friction."""
+        """Names of the axes that count: a scene has no masses and balls, a chain no
+        friction.
+        """
         if self.scene is None:
             return tuple(name for name in AXES if name != "friction")
         missing = {"mass_ratio", "balls"} | (set() if self.friction else {"friction"})
-        missing |= set() if self.scene.contacts > 1 else {"stiffness_ratio"}
+        if self.scene.contacts > 1:
+            missing |= set()
+        else:
+            missing |= {"stiffness_ratio"}
         return tuple(name for name in AXES if name not in missing)
 
     def size(self, balls: int) -> int:
         """Number n of velocities."""
-        return balls if self.scene is None else self.scene.size
+        if self.scene is None:
+            return balls
+        return self.scene.size
 
-    def impact_at(self, point: Any, balls: int, max_steps: int) -> tuple[LZB, Scene, jax.Array]:
-        """Law, scene and v- (n,) of a point (7,), without its setting; `balls` is N of a chain."""
+    def impact_at(
+        self, point: Any, balls: int, max_steps: int
+    ) -> tuple[LZB, Scene, jax.Array]:
+        """Law, scene and v- (n,) of a point (7,), without its setting; `balls` is N of
+        a chain.
+        """
         _, kappa, eta, e, mass_ratio, _, friction = point
         if self.scene is None:
             mass, stiffness = chain_of(kappa, mass_ratio, balls)
             v = jnp.zeros_like(mass).at[0].set(1.0)
             return LZB(e, stiffness, eta, max_steps=max_steps), chain(mass), v
         stiffness = stiffness_of(kappa, self.scene.contacts)
-        mu = friction if self.friction else None
+        if self.friction:
+            mu = friction
+        else:
+            mu = None
         law = LZB(e, stiffness, eta, friction=mu, max_steps=max_steps)
         return law, self.scene, self.velocity
 
     def groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-        """Groups of points (P, 7) with equal numbers of balls: indices (L,), and N (0: a scene).
+        """Groups of points (P, 7) with equal numbers of balls: indices (L,), and N (0:
+        a scene).
 
         One function is compiled for each group.
         """
-        balls = points[:, AXES.index("balls")] if self.scene is None else np.zeros(len(points))
+        if self.scene is None:
+            balls = points[:, AXES.index("balls")]
+        else:
+            balls = np.zeros(len(points))
         for n in np.unique(balls):
             yield np.flatnonzero(balls == n), int(n)
 
 
 def _checked_setup(scene: Scene | None, velocity: Any) -> Setup:
-    """The scene with its v-, scaled to 1 as the largest and checked; without a scene, chains."""
+    """The scene with its v-, scaled to 1 as the largest and checked; without a scene,
+    chains.
+    """
     if scene is None:
         if velocity is not None:
             raise ValueError("Argument `velocity` must be None without a `scene`.")
         return Setup()
     if velocity is None:
-        raise ValueError("Argument `velocity` must be given with a `scene`, but is None.")
+        raise ValueError(
+            "Argument `velocity` must be given with a `scene`, but is None."
+        )
     v = as_velocity(scene, velocity, finite=True)
     if not bool(LZB(1.0).contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
     return Setup(scene, v / jnp.max(jnp.abs(v)))
 
 
-def _methods(methods: Sequence[str | Contender] | None, setup: Setup) -> list[Contender]:
-    """Contenders to map, by name or a user's own; None: the default ones, with friction if needed.
+def _methods(
+    methods: Sequence[str | Contender] | None, setup: Setup
+) -> list[Contender]:
+    """Contenders to map, by name or a user's own; None: the default ones, with friction
+    if needed.
 
     Only those that JAX can batch are known.
     """
-    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not setup.friction)]
+    able = [
+        m for m in CONTENDERS.values() if m.jax and (m.friction or not setup.friction)
+    ]
     known = {m.name: m for m in able}
     defaults = FRICTION_NAMES if setup.friction else NAMES
     return contenders_of("methods", defaults if methods is None else methods, known)
 
 
-def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
-    """Values by axis, checked: names among `names`, numbers in the range of their axis."""
+def _checked(
+    argument: str, values: Mapping[str, Any], names: tuple[str, ...]
+) -> Mapping[str, Any]:
+    """Values by axis, checked: names among `names`, numbers in the range of their
+    axis.
+    """
     check_kind(argument, values, Mapping)
     for name, value in values.items():
         check_choice(argument, name, names)
-        axis, of_axis = _AXES[name], f"{argument}[{name!r}]"
+        axis = _AXES[name]
+        of_axis = f"{argument}[{name!r}]"
         check_values(of_axis, as_axis(of_axis, value), low=axis.low, high=axis.high)
         if name == "balls" and (np.asarray(value) % 1).any():
-            raise ValueError(f"Argument `{of_axis}` must hold whole numbers, but has {value}.")
+            raise ValueError(
+                f"Argument `{of_axis}` must hold whole numbers, but has {value}."
+            )
     return values
 
 
-def default_axes(r: int, names: tuple[str, ...] = Setup().axes) -> dict[str, np.ndarray]:
-    """`r` values of each axis by name (numbers of balls: six, or three below `_FEW`)."""
+def default_axes(
+    r: int, names: tuple[str, ...] = Setup().axes
+) -> dict[str, np.ndarray]:
+    """`r` values of each axis by name (numbers of balls: six, or three below
+    `_FEW`).
+    """
     balls = np.array(BALLS if r >= _FEW else _FEW_BALLS, float)
     return {name: balls if name == "balls" else _AXES[name].values(r) for name in names}
 
@@ -377,18 +487,26 @@ def default_axes(r: int, names: tuple[str, ...] = Setup().axes) -> dict[str, np.
 def _axis_values(
     axes: Mapping[str, Sequence[float]] | None, r: int, names: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
-    """Values of the axes to map by name: `axes`, sorted, or by default r values of all."""
+    """Values of the axes to map by name: `axes`, sorted, or by default r values of
+    all.
+    """
     if axes is None:
         return default_axes(r, names)
     axes = _checked("axes", axes or {"": ()}, names)  # no axis at all is an error
-    return {name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes}
+    return {
+        name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes
+    }
 
 
 def _slice_points(
     base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
 ) -> np.ndarray:
-    """Points (K_1 .. K_d, 7) over the values of the d axes `varied`, elsewhere at the base."""
-    columns = [axes[name] if name in varied else np.array([base[name]]) for name in AXES]
+    """Points (K_1 .. K_d, 7) over the values of the d axes `varied`, elsewhere at the
+    base.
+    """
+    columns = [
+        axes[name] if name in varied else np.array([base[name]]) for name in AXES
+    ]
     grid = np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1)
     return grid.reshape(*(len(axes[name]) for name in varied), len(AXES))
 
@@ -396,28 +514,39 @@ def _slice_points(
 def _sample_points(
     base: Mapping[str, float], axes: Mapping[str, np.ndarray], samples: int, seed: int
 ) -> np.ndarray:
-    """Latin-hypercube points (samples, 7), between the values of `axes`; others from `base`.
+    """Latin-hypercube points (samples, 7), between the values of `axes`; others from
+    `base`.
 
-    Uniform in the index of an axis' values, between two values linear, or in the logarithm where
-    all are positive (but for the exponent). Numbers of balls are those of the axis.
+    Uniform in the index of an axis' values, between two values linear, or in the
+    logarithm where all are positive (but for the exponent). Numbers of balls are those
+    of the axis.
     """
     from scipy.stats import qmc  # late: slow to import
 
     points = np.tile([base[name] for name in AXES], (samples, 1))
-    unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
+    unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(
+        samples
+    )
     for column, (name, values) in zip(unit.T, axes.items()):
         index = column * (len(values) - 1)
         if name == "balls":
             points[:, AXES.index(name)] = values[np.round(index).astype(int)]
             continue
         powers = bool((values > 0).all()) and name != "exponent"
-        scaled = np.log(values) if powers else values
+        if powers:
+            scaled = np.log(values)
+        else:
+            scaled = values
         between = np.interp(index, np.arange(len(values)), scaled)
-        points[:, AXES.index(name)] = np.exp(between) if powers else between
+        if powers:
+            points[:, AXES.index(name)] = np.exp(between)
+        else:
+            points[:, AXES.index(name)] = between
     return points
 
 
-# --------------------------------------------------------------------------- running methods
+# --------------------------------------------------------------------------- running
+# methods
 
 
 def setting_of(kind: str, level: Any) -> Any:
@@ -436,35 +565,42 @@ def setting_of(kind: str, level: Any) -> Any:
 def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
     """Masses (N,) [kg] and stiffnesses (N - 1,) of a point.
 
-    Contact j = 1..N-1 belongs to the right half where j > N // 2; ball N // 2 + 1 is the middle.
+    Contact j = 1..N-1 belongs to the right half where j > N // 2; ball N // 2 + 1 is
+    the middle.
 
     >>> from jimpact.methods.stability import chain_of
     >>> [values.tolist() for values in chain_of(10.0, 0.5, 4)]
     [[1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]]
     """
-    kappa, mu = jnp.asarray(kappa, float), jnp.asarray(mu, float)
+    kappa = jnp.asarray(kappa, float)
+    mu = jnp.asarray(mu, float)
     mass = jnp.where(jnp.arange(balls) == balls // 2, mu, jnp.ones_like(mu))
     return mass, stiffness_of(kappa, balls - 1)
 
 
 def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
-    """Stiffnesses (m,): kappa in the right half, which has no more contacts than the left one.
+    """Stiffnesses (m,): kappa in the right half, which has no more contacts than the
+    left one.
 
     >>> from jimpact.methods.stability import stiffness_of
     >>> stiffness_of(10.0, 3).tolist()
     [1.0, 1.0, 10.0]
     """
     kappa = jnp.asarray(kappa, float)
-    return jnp.where(jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa))
+    return jnp.where(
+        jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa)
+    )
 
 
-# Of points (L, 7) and settings () or (L,): outcomes (L,), and the energy gained (L,) over T-
+# Of points (L, 7) and settings () or (L,): outcomes (L,), and the energy gained (L,)
+# over T-
 Runner = Callable[[np.ndarray, Any], tuple[Outcomes, np.ndarray]]
 Runners = Callable[[Contender, int], Runner]
 
 
 def runner(max_steps: int, setup: Setup, method: Contender, balls: int) -> Runner:
-    """Function of points (L, 7) and settings that runs one method on chains of N balls or a scene.
+    """Function of points (L, 7) and settings that runs one method on chains of N balls
+    or a scene.
 
     It returns outcomes (L,) and gains of energy over T- (L,).
     """
@@ -485,18 +621,22 @@ def runner(max_steps: int, setup: Setup, method: Contender, balls: int) -> Runne
     return run
 
 
-# --------------------------------------------------------------------------- the references
+# --------------------------------------------------------------------------- the
+# references
 
 
 def references(
     points: np.ndarray, setup: Setup, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
-    """Reference v+ of the points (P, largest n), NaN if no run ends, and its check by scipy.
+    """Reference v+ of the points (P, largest n), NaN if no run ends, and its check by
+    scipy.
 
     Runs of 'time' at `REFERENCE_RTOL`.
     """
     groups = list(setup.groups(points))
-    exact = np.full((len(points), max((setup.size(n) for _, n in groups), default=0)), np.nan)
+    exact = np.full(
+        (len(points), max((setup.size(n) for _, n in groups), default=0)), np.nan
+    )
     for at, n in groups:
         # points that differ in their setting alone (column 0) share a run
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
@@ -510,7 +650,8 @@ def references(
 
 
 def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmation:
-    """Differences of the reference v+ `exact` from scipy's, at a few points that it solves soon.
+    """Differences of the reference v+ `exact` from scipy's, at a few points that it
+    solves soon.
 
     Up to `CHECKED` of them, spread over the points (P, 7).
     """
@@ -520,9 +661,13 @@ def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmatio
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
-    name, rtol, within = "scipy_dop853", CHECK_RTOL, CONFIRMED
+    name = "scipy_dop853"
+    rtol = CHECK_RTOL
+    within = CONFIRMED
     if setup.friction:
-        name, rtol, within = "scipy_radau", FRICTION_RTOL, FRICTION_CONFIRMED
+        name = "scipy_radau"
+        rtol = FRICTION_RTOL
+        within = FRICTION_CONFIRMED
     differences = []
     for i in candidates[::stride]:
         balls = int(points[i, AXES.index("balls")])
@@ -535,18 +680,24 @@ def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmatio
 
 
 def _is_quick(point: np.ndarray, setup: Setup) -> bool:
-    """True for a point (7,) that scipy solves soon, and does not end too early (small e).
+    """True for a point (7,) that scipy solves soon, and does not end too early (small
+    e).
 
-    Equation: `sqrt(2) eta / e spread < QUICK_RATIO`: the largest frequency of the linearized flow
-    is at most `sqrt(2) eta / e` of the fastest contact's, and that `spread` of the slowest's.
+    Equation: `sqrt(2) eta / e spread < QUICK_RATIO`: the largest frequency of the
+    linearized flow is at most `sqrt(2) eta / e` of the fastest contact's, and that
+    `spread` of the slowest's.
     """
     _, kappa, eta, e, mass_ratio, balls, _ = map(float, point)
-    spread = max(kappa, 1 / kappa) ** (1 / (eta + 1)) * max(mass_ratio, 1 / mass_ratio) ** 0.5
+    spread = (
+        max(kappa, 1 / kappa) ** (1 / (eta + 1))
+        * max(mass_ratio, 1 / mass_ratio) ** 0.5
+    )
     few = (balls if setup.scene is None else setup.scene.contacts) <= QUICK_BALLS
     return few and e >= RECLOSING and np.sqrt(2) * eta / e * spread < QUICK_RATIO
 
 
-# --------------------------------------------------------------------------------- classes
+# ---------------------------------------------------------------------------------
+# classes
 
 
 def classes_of(
@@ -559,18 +710,27 @@ def classes_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Class (index of `CLASSES`) and error of v+ of every point (P, 7) by one method.
 
-    Errors are the largest |v+ - exact|, over the largest |v-|, which is 1. A wrong result is tried
-    again at a finer setting: `stalls` if its error does not fall.
+    Errors are the largest |v+ - exact|, over the largest |v-|, which is 1. A wrong
+    result is tried again at a finer setting: `stalls` if its error does not fall.
     """
-    codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
+    codes = np.full(len(points), FLAGGED)
+    errors = np.full(len(points), np.nan)
     level = points[:, AXES.index("setting")]
     setting = setting_of(method.setting, level)
     fixed = np.full(len(points), FIXED_STEP_RIGHT)
-    allowed = HONEST * setting if method.setting == "rtol" else fixed
+    if method.setting == "rtol":
+        allowed = HONEST * setting
+    else:
+        allowed = fixed
     e = points[:, AXES.index("restitution")]
     for group, n in setup.groups(points):
-        run, size = runners(method, n), setup.size(n)
-        at = group[e[group] > 0] if method.divides else group  # refused at e = 0: flagged
+        run = runners(method, n)
+        size = setup.size(n)
+        # refused at e = 0: flagged
+        if method.divides:
+            at = group[e[group] > 0]
+        else:
+            at = group
         if len(at):
             out, gain = run(points[at], setting[at])
             errors[at] = relative_error(out.velocity, exact[at, :size])
@@ -578,7 +738,10 @@ def classes_of(
         wrong = at[codes[at] == WRONG]
         if len(wrong):
             finer, _ = run(points[wrong], FINER * setting[wrong])
-            falls = relative_error(finer.velocity, exact[wrong, :size]) < FALLS * errors[wrong]
+            falls = (
+                relative_error(finer.velocity, exact[wrong, :size])
+                < FALLS * errors[wrong]
+            )
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))
     return codes, errors
@@ -589,8 +752,8 @@ def _classified(
 ) -> np.ndarray:
     """Classes (L,) before a finer setting is tried: the first case that holds.
 
-    `gain` is energy over T-, `error` of v+ NaN without a reference, `allowed` the largest error
-    that is right; all (L,).
+    `gain` is energy over T-, `error` of v+ NaN without a reference, `allowed` the
+    largest error that is right; all (L,).
     """
     status = np.where(out.code == CODE["ok"], out.status, out.code)
     cases = {

@@ -1,4 +1,6 @@
-"""Validity map: for which stiffness ratios Moreau's law, or binary collisions, are right."""
+"""Validity map: for which stiffness ratios Moreau's law, or binary collisions, are
+right.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,11 +27,12 @@ RATIOS = (1e-3, 1e3, 121)  # default ratios: from, to, how many
 
 @dataclass(frozen=True)
 class ValidityMap(Tabular):
-    """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), next to laws without them.
+    """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), next to others.
 
-    `scene` and v- `before` (n,) [m/s] as passed; `velocity` (x, r, n) [m/s], `dispersion` and
-    `status` (x, r) over `exponents` (x,) and `ratios` (r,); `laws` holds v+ (n,) of Moreau's law
-    and of binary collisions, `law_dispersion` their indices.
+    `scene` and v- `before` (n,) [m/s] as passed; `velocity` (x, r, n) [m/s],
+    `dispersion` and `status` (x, r) over `exponents` (x,) and `ratios` (r,); `laws`
+    holds v+ (n,) of Moreau's law and of binary collisions, `law_dispersion` their
+    indices.
     """
 
     scene: Scene
@@ -45,19 +48,25 @@ class ValidityMap(Tabular):
     picture = "validity_map"
 
     def error(self, law: str) -> np.ndarray:
-        """Error of v+ of a law, 'moreau' or 'binary', against LZB (x, r), relative to max |v-|."""
+        """Error of v+ of a law, 'moreau' or 'binary', against LZB (x, r), relative to
+        max |v-|.
+        """
         check_choice("law", law, self.laws)
         return relative_error(self.velocity, self.laws[law], np.abs(self.before).max())
 
     def limit(self, law: str, tolerance: float = 1e-2) -> np.ndarray:
-        """Stiffness ratios (x,) that bound the range in which a law is within `tolerance`.
+        """Stiffness ratios (x,) that bound the range in which a law is within
+        `tolerance`.
 
-        Moreau's law is right from this ratio to the largest of the map, binary collisions from the
-        smallest to this one; NaN: not even there.
+        Moreau's law is right from this ratio to the largest of the map, binary
+        collisions from the smallest to this one; NaN: not even there.
         """
         check_values("tolerance", tolerance, low=0.0, open_low=True)
         inside = self.error(law) <= tolerance
-        order = slice(None, None, -1) if law == "moreau" else slice(None)
+        if law == "moreau":
+            order = slice(None, None, -1)
+        else:
+            order = slice(None)
         # number of ratios from that end of the map that are all within
         run = np.logical_and.accumulate(inside[:, order], axis=1).sum(axis=1)
         at = self.ratios[order][np.maximum(run - 1, 0)]
@@ -76,11 +85,15 @@ class ValidityMap(Tabular):
             Column("binary_up_to", _range("<="), "binary within 1 %"),
             Column("moreau_from", _range(">="), "Moreau within 1 %"),
         )
-        return Table(columns, [*zip(self.exponents, self.limit("binary"), self.limit("moreau"))])
+        return Table(
+            columns, [*zip(self.exponents, self.limit("binary"), self.limit("moreau"))]
+        )
 
 
 def _range(sign: str) -> Callable[[Any], str]:
-    """Format of a stiffness ratio that bounds a range: "ratio <= 0.1"; NaN: "nowhere"."""
+    """Format of a stiffness ratio that bounds a range: "ratio <= 0.1"; NaN:
+    "nowhere".
+    """
     return lambda ratio: "nowhere" if np.isnan(ratio) else f"ratio {sign} {ratio:.3g}"
 
 
@@ -91,10 +104,10 @@ def validity_map(
     exponents: Any = (1.0, 1.5, 2.0, 3.0),
     restitution: Any = 1.0,
 ) -> ValidityMap:
-    """Dispersion and v+ of LZB against the stiffness ratio, next to Moreau's law and binary.
+    """Dispersion and v+ of LZB against the stiffness ratio, next to other laws.
 
-    Equation: `k_j = ratio^(j - 1)`: with two contacts ratio = k2/k1, with more the stiffness
-    rises (ratio > 1) or falls from each contact to the next.
+    Equation: `k_j = ratio^(j - 1)`: with two contacts ratio = k2/k1, with more the
+    stiffness rises (ratio > 1) or falls from each contact to the next.
 
     Args:
         scene: n coordinates, m >= 2 contacts without gaps.
@@ -104,35 +117,46 @@ def validity_map(
         restitution: e in [0, 1], scalar or (m,).
 
     Returns:
-        `ValidityMap`; `ji.plot.validity_map` draws it, `print` says where which law holds.
+        `ValidityMap`; `ji.plot.validity_map` draws it, `print` says where which law
+        holds.
 
     Raises:
-        ValueError: shapes or ranges, at rest, one contact, gaps, ratios that do not rise.
+        ValueError: shapes or ranges, at rest, one contact, gaps, ratios that do not
+            rise.
 
     Source: the kind of Brogliato, Nonsmooth Mechanics (2016), figure 6.9.
 
     >>> import jimpact as ji
     >>> balls = ji.chain([1.0, 1.0, 1.0])
-    >>> result = ji.validity_map(balls, [1.0, 0.0, 0.0], [1e-3, 1.0, 1e3], exponents=[1.0])
+    >>> result = ji.validity_map(
+    ...     balls, [1.0, 0.0, 0.0], [1e-3, 1.0, 1e3], exponents=[1.0]
+    ... )
     >>> result.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
     [[0.0, 1.0], [0.15, 0.98], [0.666, 0.667]]
     """
     v = as_velocity(scene, velocity, finite=True)
     if not np.asarray(v).any():
-        raise ValueError("Argument `velocity` must not be zero: nothing happens at rest.")
+        raise ValueError(
+            "Argument `velocity` must not be zero: nothing happens at rest."
+        )
     if scene.contacts < 2 or not np.asarray(scene.closed).all():
         raise ValueError(
             "Argument `scene` must have two or more contacts, all closed, but has "
             f"{scene.contacts}, {int(np.asarray(scene.closed).sum())} of them closed."
         )
-    over = np.geomspace(*RATIOS) if ratios is None else ratios
+    if ratios is None:
+        over = np.geomspace(*RATIOS)
+    else:
+        over = ratios
     ratio = as_axis("ratios", over).astype(v.dtype)
     eta = as_axis("exponents", exponents).astype(v.dtype)
     check_values("ratios", ratio, low=0.0, open_low=True)
     check_values("exponents", eta, low=1.0)
     if (np.diff(np.asarray(ratio)) <= 0).any():
         raise ValueError("Argument `ratios` must rise, but does not.")
-    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
+    e = as_numbers(
+        "restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts
+    )
     shape = len(eta), len(ratio)
     # one impact for each exponent and ratio; k (x r, m) = ratio^(j - 1)
     exponents, ratios = (x.ravel() for x in jnp.meshgrid(eta, ratio, indexing="ij"))
@@ -151,5 +175,7 @@ def validity_map(
         dispersion=np.asarray(spread).reshape(shape),
         status=np.asarray(out.status).reshape(shape),
         laws={name: np.asarray(x) for name, x in after.items()},
-        law_dispersion={name: float(dispersion_index(scene, x)) for name, x in after.items()},
+        law_dispersion={
+            name: float(dispersion_index(scene, x)) for name, x in after.items()
+        },
     )

@@ -1,1 +1,3 @@
-"""The parts of `monte_carlo`: distributions, chunks of samples, their statistics, their files."""
+"""The parts of `monte_carlo`: distributions, chunks of samples, their statistics, their
+files.
+"""

@@ -14,8 +14,11 @@ from jimpact.plot.style import SMALL, WIDTH, colour_of, styled
 from jimpact.tools.records import readable_unit
 
 _BARS = 30  # of a histogram: each is several pixels wide
-_MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
-_TICKS = 3  # at most, on the axis of a velocity: those of a narrow range have many digits
+# height of the mean, and of the axis, over that of the highest bar
+_MEAN_AT = 1.12
+_TOP = 1.25
+# at most, on the axis of a velocity: those of a narrow range have many digits
+_TICKS = 3
 _BODIES = 6  # histograms; of more bodies only the most scattered are drawn
 _DOT = 4.0  # area of a sample in the map [points^2]
 _TITLE = 80  # letters of a line of the title
@@ -23,12 +26,12 @@ _TITLE = 80  # letters of a line of the title
 
 @styled(MonteCarlo)
 def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
-    """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
+    """Histograms of every body, and the first samples over two gaps.
 
-    Gaps are over the indentation of the contact (delta_c of `ji.theory.gap_scale`), where it is
-    known. Each velocity has an axis of its own. The map shows the most scattered velocity over the
-    two gaps with which it is most correlated; with one random gap, that velocity against it;
-    without, no map.
+    Gaps are over the indentation of the contact (delta_c of `ji.theory.gap_scale`),
+    where it is known. Each velocity has an axis of its own. The map shows the most
+    scattered velocity over the two gaps with which it is most correlated; with one
+    random gap, that velocity against it; without, no map.
 
     Args:
         result: what `ji.monte_carlo` returned.
@@ -52,7 +55,9 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     mapped = result.first["gaps"].shape[1] > 0
     mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
     figure = Figure(figsize=(WIDTH, max(4.8, 2.0 * len(bodies))))
-    figure.suptitle(title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left")
+    figure.suptitle(
+        title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left"
+    )
     panels = figure.subplot_mosaic(mosaic)
     for body in bodies:
         axes = panels[str(body)]
@@ -64,11 +69,15 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
 
 
 def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
-    """Draw the share of the samples [%] by v+ of a body, its mean, and 5 % to 95 % as a bar."""
+    """Draw the share of the samples [%] by v+ of a body, its mean, and 5 % to 95 % as a
+    bar.
+    """
     # without the counts below the first edge and above the last one
-    counts, edges = result.counts[body, 1:-1], result.edges[body]
+    counts = result.counts[body, 1:-1]
+    edges = result.edges[body]
     each = max(1, len(counts) // _BARS)  # bins of a bar
-    whole = len(counts) // each * each  # bins in whole bars; the last bar takes the rest
+    # bins in whole bars; the last bar takes the rest
+    whole = len(counts) // each * each
     bars = counts[:whole].reshape(-1, each).sum(axis=1)
     bars[-1] += counts[whole:].sum()
     share = 100 * bars / max(result.count, 1)
@@ -76,12 +85,15 @@ def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     ends = np.append(edges[:whole:each], edges[-1])
     axes.stairs(share, ends, color=colour, fill=True)
     top = float(share.max())
-    mean, (low, high) = result.mean[body], result.quantile([0.05, 0.95])[:, body]
+    mean = result.mean[body]
+    low, high = result.quantile([0.05, 0.95])[:, body]
     height = _MEAN_AT * top
     axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
     axes.set_ylim(0, _TOP * top)
-    label = f"body {body + 1}: mean {mean:.4g}, std {result.std[body]:.2g} {result.unit}"
+    label = (
+        f"body {body + 1}: mean {mean:.4g}, std {result.std[body]:.2g} {result.unit}"
+    )
     axes.set_title(label, fontsize=SMALL, color=colour)
     axes.set(xlabel=f"velocity after the impact [{result.unit}]", ylabel="samples [%]")
     axes.ticklabel_format(axis="x", useOffset=False)
@@ -102,7 +114,8 @@ def _most_correlated_gaps(result: MonteCarlo, body: int) -> list[int]:
 
 
 def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
-    """Draw the first samples over their two most correlated gaps, coloured by v+ of a body.
+    """Draw the first samples over their two most correlated gaps, coloured by v+ of a
+    body.
 
     Of a single random gap: v+ over this gap.
     """
@@ -127,8 +140,12 @@ def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.set_aspect("equal" if _alike(x, y) else "auto")
 
 
-def _in_units(result: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndarray, str]:
-    """Gaps over delta_c of a contact if it is known, else in nm, µm, mm or m; the axis' label."""
+def _in_units(
+    result: MonteCarlo, gap: np.ndarray, contact: int
+) -> tuple[np.ndarray, str]:
+    """Gaps over delta_c of a contact if it is known, else in nm, µm, mm or m; the axis'
+    label.
+    """
     name = f"gap {contact + 1}"
     if result.gap_scale is not None:
         scale = result.gap_scale[contact]
@@ -140,5 +157,8 @@ def _in_units(result: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.nda
 
 def _alike(x: np.ndarray, y: np.ndarray) -> bool:
     """True if the ranges of x and y differ by less than a factor of 2."""
-    a, b = np.ptp(x), np.ptp(y)
-    return bool(0.5 < a / b < 2) if b > 0 else False
+    a = np.ptp(x)
+    b = np.ptp(y)
+    if b > 0:
+        return bool(0.5 < a / b < 2)
+    return False

@@ -20,7 +20,14 @@ from jimpact.montecarlo.statistics import (
     part,
 )
 from jimpact.tools.checks import as_float_array, check_values
-from jimpact.tools.records import Column, Table, Tabular, as_data, counted, fields_as_data
+from jimpact.tools.records import (
+    Column,
+    Table,
+    Tabular,
+    as_data,
+    counted,
+    fields_as_data,
+)
 
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
 _OUTCOMES = {row.name: row for row in OUTCOMES}
@@ -28,7 +35,8 @@ _OUTCOMES = {row.name: row for row in OUTCOMES}
 
 @dataclass(frozen=True, eq=False)
 class BadSample:
-    """A failed sample: its number from 0, status, gaps (m,) [m] and velocities v- (n,) [m/s].
+    """A failed sample: its number from 0, status, gaps (m,) [m] and velocities v- (n,)
+    [m/s].
 
     Gaps or velocities that are the same for all samples are empty here.
     """
@@ -58,13 +66,14 @@ class MonteCarlo(Tabular):
         statuses: number of samples by status.
         bad: the first failed samples; `replay(sample.index)` gives one to run again.
         first: the first samples, for pictures: gaps, velocity_before, velocity, status.
-        gap_scale: delta_c (m,) [m], the indentation of a contact (`ji.theory.gap_scale`), or None.
+        gap_scale: delta_c (m,) [m], the indentation of a contact
+            (`ji.theory.gap_scale`), or None.
         rate: samples computed a second [1/s], without compiling.
         resumed: samples that were read from the folder.
         rtol: tolerance of the impacts; None: the law's own, or it needs none.
-        rtol_error: estimated error of the means and deviations by a tolerance above the law's
-            default, in standard errors, the largest; 0: it is the default, and nothing finer was
-            tried, so that its own error is not estimated.
+        rtol_error: estimated error of the means and deviations by a tolerance above the
+            law's default, in standard errors, the largest; 0: it is the default, and
+            nothing finer was tried, so that its own error is not estimated.
         description: law, scene and distributions, in words.
         run: the requested run; `replay` needs it.
     """
@@ -109,7 +118,9 @@ class MonteCarlo(Tabular):
         return self.edges[:, 1] - self.edges[:, 0]
 
     def quantile(self, q: Any) -> np.ndarray:
-        """Quantiles (..., n) [m/s] of the velocities after, from the histograms; q in [0, 1]."""
+        """Quantiles (..., n) [m/s] of the velocities after, from the histograms; q in
+        [0, 1].
+        """
         q = np.asarray(as_float_array("q", q))
         check_values("q", q, low=0.0, high=1.0)
         ends = self.edges[:, [0, -1]]
@@ -121,13 +132,15 @@ class MonteCarlo(Tabular):
         return velocity_unit(self.run.scene)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
-        """Law, scene and velocity of sample `index`: `ji.impact(*result.replay(index))`.
+        """Law, scene and velocity of sample `index`:
+        `ji.impact(*result.replay(index))`.
 
         The law integrates as finely as in the run.
         """
         if not 0 <= index < self.samples:
             raise ValueError(
-                f"Argument `index` must lie in [0, {self.samples - 1}], but has value {index}."
+                f"Argument `index` must lie in [0, {self.samples - 1}], but has value "
+                f"{index}."
             )
         law, scene, velocity = self.run.sample(index)
         if self.rtol_error:
@@ -143,7 +156,9 @@ class MonteCarlo(Tabular):
 
     @property
     def table(self) -> Table:
-        """Table: mean, its error, std, quantiles and range of each velocity v+, with notes."""
+        """Table: mean, its error, std, quantiles and range of each velocity v+, with
+        notes.
+        """
         columns = (
             Column("coordinate", head=f"[{self.unit}]"),
             Column("mean", ".6f"),
@@ -156,32 +171,54 @@ class MonteCarlo(Tabular):
         names = [f"v{i + 1}+" for i in range(len(self.mean))]
         values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
         rows = [*zip(names, self.mean, self.standard_error, *values)]
-        head = [f"{counted(self.samples, 'sample')} of {self.description}", self._rate()]
+        head = [
+            f"{counted(self.samples, 'sample')} of {self.description}",
+            self._rate(),
+        ]
         head += [*self._tolerance_lines(), ""]
-        right = f"Quantiles are right to {self.quantile_resolution.max():.2g} {self.unit}"
+        right = (
+            f"Quantiles are right to {self.quantile_resolution.max():.2g} {self.unit}"
+        )
         notes = [f"{right}; std. error: of the mean, std: of one impact.", ""]
         notes += [*self._gap_lines(), *self._status_lines()]
         return Table(columns, rows, head, notes)
 
     def _rate(self) -> str:
-        """Phrase: samples a second, and the number of samples that were read from the folder."""
+        """Phrase: samples a second, and the number of samples that were read from the
+        folder.
+        """
         if self.resumed == self.samples:
             return "all read from the folder"
         rate = f"{self.rate:,.0f}"
         text = f"{rate} {'sample' if rate == '1' else 'samples'}/s"
-        return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
+        return text + (
+            f", {self.resumed:,} read from the folder" if self.resumed else ""
+        )
 
     def _tolerance_lines(self) -> list[str]:
-        """Line on the tolerance of the impacts: of the run, or the law's; none if there is none."""
+        """Line on the tolerance of the impacts: of the run, or the law's; none if there
+        is none.
+        """
         if self.rtol is None:
             return []
         if not self.rtol_error:
-            return [f"integrated to rtol = {self.rtol:g}, whose error in means was not estimated"]
-        text = f"integrated to rtol = {self.rtol:g}: its error in means and deviations is at most"
+            return [
+                (
+                    f"integrated to rtol = {self.rtol:g}, whose error in means was not "
+                    f"estimated"
+                )
+            ]
+        text = (
+            f"integrated to rtol = {self.rtol:g}: its error in means and "
+            f"deviations "
+            f"is at most"
+        )
         return [f"{text} {self.rtol_error:.1g} standard errors"]
 
     def _gap_lines(self) -> list[str]:
-        """Lines on mean and standard deviation of each random gap, in m and over delta_c."""
+        """Lines on mean and standard deviation of each random gap, in m and over
+        delta_c.
+        """
         lines = []
         for j, mean in enumerate(self.gap_mean):
             std = np.sqrt(self.gap_covariance[j, j])
@@ -190,29 +227,46 @@ class MonteCarlo(Tabular):
                 scale = self.gap_scale[j]
                 lines[-1] += f"; in units of delta_c = {scale:.3g} m: "
                 lines[-1] += f"{mean / scale:.3g} and {std / scale:.3g}"
-        return [*lines, DELTA_C] if lines and self.gap_scale is not None else lines
+        if lines and self.gap_scale is not None:
+            return [*lines, DELTA_C]
+        return lines
 
     def _status_lines(self) -> list[str]:
-        """Lines on the number of samples of each status, and on the first failed samples."""
+        """Lines on the number of samples of each status, and on the first failed
+        samples.
+        """
         lines = []
         for name, count in self.statuses.items():
-            left_out = ", left out" if _OUTCOMES[name].failure else ""
+            if _OUTCOMES[name].failure:
+                left_out = ", left out"
+            else:
+                left_out = ""
             lines.append(f"{name}: {count:,}{left_out} ({_OUTCOMES[name].message})")
         for bad in self.bad[:5]:
-            gaps = f", gaps {np.array2string(bad.gaps, precision=6)} m" if bad.gaps.size else ""
-            lines.append(f"  sample {bad.index}: {bad.status}{gaps}; replay({bad.index})")
+            if bad.gaps.size:
+                gaps = f", gaps {np.array2string(bad.gaps, precision=6)} m"
+            else:
+                gaps = ""
+            lines.append(
+                f"  sample {bad.index}: {bad.status}{gaps}; replay({bad.index})"
+            )
         return lines
 
 
 def result_of(
     run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
 ) -> MonteCarlo:
-    """Result of a run from `total`, the joined statistics of all its chunks (see `statistics.py`).
+    """Result of a run from `total`, the joined statistics of all its chunks (see
+    `statistics.py`).
 
-    `resumed` samples were read, `rate` [1/s] were computed, `gap_scale` is delta_c (m,) [m].
+    `resumed` samples were read, `rate` [1/s] were computed, `gap_scale` is delta_c (m,)
+    [m].
     """
-    n, count, bad = len(total["ends"]), int(total["used"]), part(total, "bad")
-    mean, (rtol, error) = total["mean"], total["tolerance"]
+    n = len(total["ends"])
+    count = int(total["used"])
+    bad = part(total, "bad")
+    mean = total["mean"]
+    rtol, error = total["tolerance"]
     # of n velocities after, then of m gaps
     covariance = total["products"] / (count - 1 if count > 1 else np.nan)
     failed = zip(bad["index"], bad["status"], bad["gaps"], bad["velocity_before"])
@@ -229,13 +283,16 @@ def result_of(
         edges=bin_edges(total["ends"], run.bins),
         counts=total["counts"],
         statuses=named(total["statuses"]),
-        bad=tuple(BadSample(int(i), OUTCOMES[code].name, *rest) for i, code, *rest in failed),
+        bad=tuple(
+            BadSample(int(i), OUTCOMES[code].name, *rest) for i, code, *rest in failed
+        ),
         first={name: x[:IN_MEMORY] for name, x in part(total, "raw").items()},
         gap_scale=gap_scale,
         rate=rate,
         resumed=resumed,
         rtol=float(rtol) or None,
-        rtol_error=float(error * np.sqrt(count)),  # from standard deviations to standard errors
+        # from standard deviations to standard errors
+        rtol_error=float(error * np.sqrt(count)),
         description=run.description,
         run=run,
     )

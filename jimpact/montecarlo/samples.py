@@ -1,11 +1,14 @@
-"""Inputs that determine the samples of a run: checked, in one precision, named by a hash.
+"""Inputs that determine the samples of a run: checked, in one precision, named by a
+hash.
 
-A chunk is always computed at its full size, on one device, by the same program; the statistics are
-numpy's, in float64. So they depend neither on the executor nor on the number of devices. (A program
-that `shard_map` spreads over two devices has other last bits than that for one.)
+A chunk is always computed at its full size, on one device, by the same program; the
+statistics are numpy's, in float64. So they depend neither on the executor nor on the
+number of devices. (A program that `shard_map` spreads over two devices has other last
+bits than that for one.)
 
-Sample i is lane i % C of chunk i // C; its key is `fold_in(fold_in(key, chunk), lane)`. Draws and
-impacts are two compiled programs, so that draws made again give the same bits.
+Sample i is lane i % C of chunk i // C; its key is `fold_in(fold_in(key, chunk), lane)`.
+Draws and impacts are two compiled programs, so that draws made again give the same
+bits.
 """
 
 import contextlib
@@ -19,7 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact.core.distributions import Distribution, GivenRows, as_source, warn_without_key
+from jimpact.core.distributions import (
+    Distribution,
+    GivenRows,
+    as_source,
+    warn_without_key,
+)
 from jimpact.core.impacts import impact
 from jimpact.core.law import Law, within_domains
 from jimpact.core.scene import Scene, rounded_gaps, with_gaps
@@ -39,14 +47,16 @@ from jimpact.tools.compiling import precise_jit
 from jimpact.tools.records import counted
 
 _WRITTEN = 6  # velocities that the report lists
-SAMPLES = 100_000  # default number of samples; ten times more: quantiles three times finer
+# default number of samples; ten times more: quantiles three times finer
+SAMPLES = 100_000
 
 
 class Sources(eqx.Module):
-    """Law, velocity and gaps of the samples: sources, or what was drawn from them for a chunk.
+    """Law, velocity and gaps of the samples: sources, or what was drawn from them for a
+    chunk.
 
-    A source is a distribution, a function of a key, `GivenRows`, or a constant (array, `Law`,
-    None). Of a chunk, what is random has a leading axis (C,).
+    A source is a distribution, a function of a key, `GivenRows`, or a constant (array,
+    `Law`, None). Of a chunk, what is random has a leading axis (C,).
     """
 
     law: Any
@@ -55,7 +65,9 @@ class Sources(eqx.Module):
 
     @property
     def random(self) -> dict[str, bool]:
-        """True by name of a source, 'law', 'velocity' or 'gaps', that differs between samples."""
+        """True by name of a source, 'law', 'velocity' or 'gaps', that differs between
+        samples.
+        """
         return {
             name: not (x is None or isinstance(x, Law) or getattr(x, "ndim", 0) == 1)
             for name, x in vars(self).items()
@@ -64,39 +76,62 @@ class Sources(eqx.Module):
 
 @precise_jit
 def draw(
-    sources: Sources, scene: Scene, key: jax.Array, lanes: jax.Array, rows: dict[str, jax.Array]
+    sources: Sources,
+    scene: Scene,
+    key: jax.Array,
+    lanes: jax.Array,
+    rows: dict[str, jax.Array],
 ) -> Sources:
-    """Law, velocities (C, n) and gaps (C, m) of a chunk; what is constant has no axis of samples.
+    """Law, velocities (C, n) and gaps (C, m) of a chunk; what is constant has no axis
+    of samples.
 
-    `key` is the chunk's, `lanes` (C,) are 0, 1, ...; `rows` holds given samples by name.
+    `key` is the chunk's, `lanes` (C,) are 0, 1, ...; `rows` holds given samples by
+    name.
     """
     # (C, 3): for law, velocity and gaps of each sample
-    keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(lanes)
+    keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(
+        lanes
+    )
 
     def entries(name: str, size: int, each: jax.Array, non_negative: bool) -> Any:
-        """Draws (C, size) of a source by the keys `each` (C,); else its given rows or constant."""
+        """Draws (C, size) of a source by the keys `each` (C,); else its given rows or
+        constant.
+        """
         source = getattr(sources, name)
         if isinstance(source, Distribution):
             dtype = jnp.result_type(*jax.tree.leaves(source))
-            return jax.vmap(lambda key: source.sample(key, size, dtype, non_negative))(each)
-        return jax.vmap(source)(each) if callable(source) else rows.get(name, source)
+            return jax.vmap(lambda key: source.sample(key, size, dtype, non_negative))(
+                each
+            )
+        if callable(source):
+            return jax.vmap(source)(each)
+        return rows.get(name, source)
 
-    law = eqx.filter_vmap(sources.law)(keys[:, 0]) if sources.random["law"] else sources.law
+    if sources.random["law"]:
+        law = eqx.filter_vmap(sources.law)(keys[:, 0])
+    else:
+        law = sources.law
     velocity = entries("velocity", scene.size, keys[:, 1], False)
     return Sources(law, velocity, entries("gaps", scene.contacts, keys[:, 2], True))
 
 
 @precise_jit
 def impacts(
-    drawn: Sources, scene: Scene, random: dict[str, bool], size: int, rtol: np.ndarray | None
+    drawn: Sources,
+    scene: Scene,
+    random: dict[str, bool],
+    size: int,
+    rtol: np.ndarray | None,
 ) -> tuple[jax.Array, jax.Array]:
     """Velocities v+ (C, n) and statuses (C,) of the C = `size` samples of a chunk.
 
-    A bad draw has a code of its own, see `OUTCOMES`. `random` tells which sources have an axis of
-    samples; `rtol` () is that of `impact`, None: the law's own.
+    A bad draw has a code of its own, see `OUTCOMES`. `random` tells which sources have
+    an axis of samples; `rtol` () is that of `impact`, None: the law's own.
     """
 
-    def one(law: Law, velocity: jax.Array, gaps: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+    def one(
+        law: Law, velocity: jax.Array, gaps: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array]:
         """v+ (n,) and status () of one sample with v- `velocity` (n,) and gaps (m,)."""
         code = jnp.where(within_domains(law), 0, BAD_LAW)
         code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
@@ -141,11 +176,13 @@ class Run:
         return reduced(task, outcomes, self.bins, self.keep_samples)
 
     def outcomes(self, task: Task, device: jax.Device | None = None) -> Chunk:
-        """Samples of a chunk by name: v- and gaps that were drawn, v+ `velocity`, `status`.
+        """Samples of a chunk by name: v- and gaps that were drawn, v+ `velocity`,
+        `status`.
 
         Arrays (C, n), (C, m), (C, n), (C,); without columns for what is constant.
         """
-        random, rtol = self.sources.random, task.tolerance.rtol
+        random = self.sources.random
+        rtol = task.tolerance.rtol
         with self.flags():
             drawn, scene = self._drawn(task, device)
             velocity, status = impacts(
@@ -166,13 +203,19 @@ class Run:
         return -(-self.samples // self.size)
 
     def count(self, number: int) -> int:
-        """Number of samples of a chunk that are used: fewer than its size in the last one."""
+        """Number of samples of a chunk that are used: fewer than its size in the last
+        one.
+        """
         return min(self.size, self.samples - number * self.size)
 
     def task(
-        self, number: int, tolerance: Tolerance = AS_THE_LAW, ends: np.ndarray | None = None
+        self,
+        number: int,
+        tolerance: Tolerance = AS_THE_LAW,
+        ends: np.ndarray | None = None,
     ) -> Task:
-        """Task of chunk `number`; `ends` (n, 2) of its histograms, None: from its own samples.
+        """Task of chunk `number`; `ends` (n, 2) of its histograms, None: from its own
+        samples.
 
         Given rows of the last chunk are filled up with copies of the last row.
         """
@@ -184,27 +227,42 @@ class Run:
         return Task(number, self.count(number), ends, rows, tolerance)
 
     def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
-        """Law, scene and v- of sample `index`, by the same draws as in the run, bit by bit."""
+        """Law, scene and v- of sample `index`, by the same draws as in the run, bit by
+        bit.
+        """
         number, lane = divmod(index, self.size)
         with self.flags():
             drawn, _ = self._drawn(self.task(number), None)
         # random sources have an axis of samples
         law, velocity, gaps = (
-            jax.tree.map(lambda x: x[lane] if eqx.is_array(x) else x, getattr(drawn, name))
+            jax.tree.map(
+                lambda x: x[lane] if eqx.is_array(x) else x, getattr(drawn, name)
+            )
             if random
             else getattr(drawn, name)
             for name, random in self.sources.random.items()
         )
-        return law, self.scene if gaps is None else with_gaps(self.scene, gaps), velocity
+        return (
+            law,
+            self.scene if gaps is None else with_gaps(self.scene, gaps),
+            velocity,
+        )
 
     @contextlib.contextmanager
     def flags(self) -> Iterator[None]:
-        """Set precision and kind of random bits of the run in JAX, in this thread, while open."""
-        with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
+        """Set precision and kind of random bits of the run in JAX, in this thread,
+        while open.
+        """
+        with (
+            jax.enable_x64(self.x64),
+            jax.threefry_partitionable(self.threefry_partitionable),
+        ):
             yield
 
     def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Sources, Scene]:
-        """Draws of a task's chunk, and the scene, on a device: programs run where inputs are."""
+        """Draws of a task's chunk, and the scene, on a device: programs run where
+        inputs are.
+        """
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
         key = jax.random.fold_in(key, np.uint32(task.number))
         lanes = np.arange(self.size, dtype=np.uint32)
@@ -216,7 +274,9 @@ class Run:
 
     @property
     def identity(self) -> dict[str, str]:
-        """Hashes by name of all that determines the chunks; the number of samples does not."""
+        """Hashes by name of all that determines the chunks; the number of samples does
+        not.
+        """
         parts = {
             "law": self.sources.law,
             "scene": self.scene,
@@ -227,14 +287,21 @@ class Run:
             "bins": self.bins,
             "precision": self.x64,
         }
-        versions = {"version of jimpact": jimpact.__version__, "version of jax": jax.__version__}
+        versions = {
+            "version of jimpact": jimpact.__version__,
+            "version of jax": jax.__version__,
+        }
         return {name: fingerprint(value) for name, value in parts.items()} | versions
 
     @property
     def description(self) -> str:
         """Law, sizes of the scene, random sources and v- of the run in one line."""
-        sources, scene = self.sources, self.scene
-        law = type(sources.law).__name__ if isinstance(sources.law, Law) else _named(sources.law)
+        sources = self.sources
+        scene = self.scene
+        if isinstance(sources.law, Law):
+            law = type(sources.law).__name__
+        else:
+            law = _named(sources.law)
         size = counted(scene.size, "coordinate"), counted(scene.contacts, "contact")
         text = ", ".join([law, *size])
         for what in ("gaps", "velocity"):
@@ -242,8 +309,14 @@ class Run:
                 text += f"; {what}: {_named(getattr(sources, what))}"
         if not sources.random["velocity"]:
             entries = [f"{x:g}" for x in np.asarray(sources.velocity)]
-            more = [f"... {len(entries)} entries"] if len(entries) > _WRITTEN else []
-            unit = "m/s" if scene.walls is not None else "m/s, rad/s"
+            if len(entries) > _WRITTEN:
+                more = [f"... {len(entries)} entries"]
+            else:
+                more = []
+            if scene.walls is not None:
+                unit = "m/s"
+            else:
+                unit = "m/s, rad/s"
             text += f"; v- = ({', '.join(entries[:_WRITTEN] + more)}) {unit}"
         return text
 
@@ -257,22 +330,32 @@ def planned_run(
     bins: int,
     keep_samples: bool,
 ) -> Run:
-    """Run of these arguments, as of `monte_carlo`, checked; `chunk` is the size of a chunk."""
+    """Run of these arguments, as of `monte_carlo`, checked; `chunk` is the size of a
+    chunk.
+    """
     check_kind("scene", scene, Scene)
     sources = _checked_sources(sources, scene)
-    rows = {name: np.asarray(x) for name, x in vars(sources).items() if getattr(x, "ndim", 1) == 2}
-    chunk, bins = as_whole("chunk", chunk, 1), as_whole("bins", bins, 1)
+    rows = {
+        name: np.asarray(x)
+        for name, x in vars(sources).items()
+        if getattr(x, "ndim", 1) == 2
+    }
+    chunk = as_whole("chunk", chunk, 1)
+    bins = as_whole("bins", bins, 1)
     fewest = min(map(len, rows.values()), default=SAMPLES)
     samples = as_whole("samples", fewest if samples is None else samples, 1)
     for name, values in rows.items():
         if len(values) < samples:
             raise ValueError(
-                f"Argument `samples` must be at most {len(values)}, the rows of `{name}`, but has "
+                f"Argument `samples` must be at most {len(values)}, the rows of "
+                f"`{name}`, but has "
                 f"value {samples}."
             )
     data, kind = _key(key)
     return Run(
-        sources=Sources(**vars(sources) | {name: GivenRows(len(x)) for name, x in rows.items()}),
+        sources=Sources(
+            **vars(sources) | {name: GivenRows(len(x)) for name, x in rows.items()}
+        ),
         rows=rows,
         scene=scene,
         samples=samples,
@@ -287,35 +370,49 @@ def planned_run(
 
 
 def _checked_sources(sources: Sources, scene: Scene) -> Sources:
-    """Sources of law, velocity and gaps, checked, with numbers in the widest float type of all."""
-    law, gaps = sources.law, sources.gaps
+    """Sources of law, velocity and gaps, checked, with numbers in the widest float type
+    of all.
+    """
+    law = sources.law
+    gaps = sources.gaps
     if isinstance(law, type) or not (isinstance(law, Law) or callable(law)):
-        raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
+        raise TypeError(
+            f"Argument `law` must be a Law or a function key -> Law, but is {law!r}."
+        )
     velocity = as_source("velocity", sources.velocity, scene.size, non_negative=False)
     if gaps is not None:
         gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
     checked = Sources(law, velocity, gaps)
     if gaps is None and not any(checked.random.values()):
         raise ValueError(
-            "Argument `gaps` must be given where neither the velocity nor the law is random: all "
+            "Argument `gaps` must be given where neither the velocity nor the law is "
+            "random: all "
             "samples would be the same."
         )
     # a function of a key is called once, to look at its law
-    drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
+    if isinstance(law, Law):
+        drawn = law
+    else:
+        drawn = law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
-        raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
+        raise TypeError(
+            f"Argument `law` must give a Law for a key, but gives {drawn!r}."
+        )
     if drawn is not law:
         warn_without_key("law", law)
     if gaps is not None and not drawn.uses_gaps:
         raise ValueError(
-            f"Argument `gaps` must be None for {type(drawn).__name__}, which leaves open contacts "
+            f"Argument `gaps` must be None for {type(drawn).__name__}, which leaves "
+            f"open contacts "
             "out: laws that use gaps are Compliant and Binary."
         )
     return in_common_dtype(checked, scene, drawn)[0]
 
 
 def _named(source: Any) -> str:
-    """Text on a source: the distribution with its parameters, or the name of a function."""
+    """Text on a source: the distribution with its parameters, or the name of a
+    function.
+    """
     if isinstance(source, eqx.Module):
         return repr(source)
     return f"function {getattr(source, '__qualname__', type(source).__name__)}"
@@ -327,10 +424,18 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
         if not -(2**63) <= key < 2**63:
             raise ValueError(f"Argument `key` must have at most 64 bits, but is {key}.")
         key = jax.random.key(int(key), impl="threefry2x32")
-    elif isinstance(key, np.ndarray | jax.Array) and key.dtype == np.uint32 and key.shape == (2,):
+    elif (
+        isinstance(key, np.ndarray | jax.Array)
+        and key.dtype == np.uint32
+        and key.shape == (2,)
+    ):
         key = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")
-    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        raise TypeError(f"Argument `key` must be a JAX random key or an integer, but is {key!r}.")
+    if not (
+        isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    ):
+        raise TypeError(
+            f"Argument `key` must be a JAX random key or an integer, but is {key!r}."
+        )
     if key.shape != ():
         raise ValueError(f"Argument `key` must be one key, but has shape {key.shape}.")
     return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))

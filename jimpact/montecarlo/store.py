@@ -1,7 +1,9 @@
-"""The folder of a run: one file a chunk, written whole or not at all, and a manifest of hashes.
+"""The folder of a run: one file a chunk, written whole or not at all, and a manifest of
+hashes.
 
-`manifest.json` names what the run is, by a hash of each thing that determines its result; every
-`chunk-0000012.npz` carries the hash of these, and numpy's zip files a checksum of each array.
+`manifest.json` names what the run is, by a hash of each thing that determines its
+result; every `chunk-0000012.npz` carries the hash of these, and numpy's zip files a
+checksum of each array.
 """
 
 import errno
@@ -23,7 +25,8 @@ import numpy as np
 
 from jimpact.montecarlo.statistics import Chunk, part
 
-# Of a manifest: 2 names classes of jimpact without their modules, 3 has the tolerance of chunks.
+# Of a manifest: 2 names classes of jimpact without their modules, 3 has the tolerance
+# of chunks.
 FORMAT = {"format": "3"}
 MANIFEST = "manifest.json"
 
@@ -31,8 +34,9 @@ MANIFEST = "manifest.json"
 def fingerprint(value: Any) -> str:
     """Hexadecimal SHA-256 of everything that `value` holds.
 
-    A function counts as its qualified name, its source (its byte code where there is none), its
-    defaults, and the values it closes over; what it reads from globals is not seen.
+    A function counts as its qualified name, its source (its byte code where there is
+    none), its defaults, and the values it closes over; what it reads from globals is
+    not seen.
 
     >>> from jimpact.montecarlo.store import fingerprint
     >>> fingerprint([1.0, "a"]) == fingerprint([1.0, "a"]) != fingerprint([2.0, "a"])
@@ -42,10 +46,11 @@ def fingerprint(value: Any) -> str:
 
 
 def _described(value: Any, inside: tuple[int, ...]) -> Any:
-    """A value as nested tuples of texts and bytes, equal for equal values, to be hashed.
+    """A value as nested tuples of texts and bytes, equal for equal values, to be
+    hashed.
 
-    `inside` are the ids of the objects that hold it: one that holds itself, as a recursive
-    function does, is named there, not entered again.
+    `inside` are the ids of the objects that hold it: one that holds itself, as a
+    recursive function does, is named there, not entered again.
     """
     name = _name(type(value))
     if id(value) in inside:
@@ -53,7 +58,12 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
     each = partial(_described, inside=(*inside, id(value)))
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
-        return name, str(array.dtype), array.shape, np.ascontiguousarray(array).tobytes()
+        return (
+            name,
+            str(array.dtype),
+            array.shape,
+            np.ascontiguousarray(array).tobytes(),
+        )
     if isinstance(value, Mapping):
         return name, sorted(((each(k), each(x)) for k, x in value.items()), key=repr)
     if isinstance(value, list | tuple):
@@ -72,7 +82,8 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
         return name, repr(value)
     if isinstance(value, type):
         return name, _name(value)
-    if hasattr(value, "__dict__"):  # a module of Equinox, a jitted function, a user's object
+    # a module of Equinox, a jitted function, a user's object
+    if hasattr(value, "__dict__"):
         return name, each(dict(vars(value)))
     try:
         return name, pickle.dumps(value, protocol=4)
@@ -81,17 +92,26 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
 
 
 def _source(function: FunctionType) -> Any:
-    """Source text of a function; if there is none, its byte code with names and constants."""
+    """Source text of a function; if there is none, its byte code with names and
+    constants.
+    """
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):
         code = function.__code__
-        return code.co_code, code.co_names, [x for x in code.co_consts if not inspect.iscode(x)]
+        return (
+            code.co_code,
+            code.co_names,
+            [x for x in code.co_consts if not inspect.iscode(x)],
+        )
 
 
 def _name(value: Any) -> str:
-    """Module and qualified name; of jimpact's own the name alone, since its files may move."""
-    module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", type(value))
+    """Module and qualified name; of jimpact's own the name alone, since its files may
+    move.
+    """
+    module = getattr(value, "__module__", "")
+    name = getattr(value, "__qualname__", type(value))
     return f"{'ji' if str(module).partition('.')[0] == 'jimpact' else module}.{name}"
 
 
@@ -104,11 +124,14 @@ class Store:
     """
 
     def __init__(self, folder: str | Path, identity: dict[str, str]):
-        """Open the folder of a run, or begin it; `identity` are hashes by name, see `Run`."""
+        """Open the folder of a run, or begin it; `identity` are hashes by name, see
+        `Run`.
+        """
         identity = identity | FORMAT
         if not isinstance(folder, str | Path):
             raise TypeError(f"Argument `folder` must be a path, but is {folder!r}.")
-        self.folder, self.run = Path(folder), _run(identity)
+        self.folder = Path(folder)
+        self.run = _run(identity)
         self.folder.mkdir(parents=True, exist_ok=True)
         manifest = self.folder / MANIFEST
         if not any(self.folder.glob("chunk-*.npz")):  # nothing of any run is lost
@@ -116,7 +139,8 @@ class Store:
             return
         if not manifest.exists():
             raise ValueError(
-                f"Folder '{folder}' has chunks but no {MANIFEST}, so the run that they belong "
+                f"Folder '{folder}' has chunks but no {MANIFEST}, so the run that they "
+                f"belong "
                 "to is unknown: give another folder, or delete them."
             )
         other = _identity(self.folder)
@@ -124,12 +148,15 @@ class Store:
         differ = [name for name in names if identity.get(name) != other.get(name)]
         if FORMAT.items() - other.items():
             raise ValueError(
-                f"Folder '{folder}' holds a run that an earlier build of jimpact began, which this "
-                "one cannot continue: give another folder (`read_samples` reads raw samples)."
+                f"Folder '{folder}' holds a run that an earlier build of jimpact "
+                f"began, which this "
+                "one cannot continue: give another folder (`read_samples` reads raw "
+                "samples)."
             )
         if differ:
             raise ValueError(
-                f"Folder '{folder}' holds another run, which differs in {', '.join(differ)}: "
+                f"Folder '{folder}' holds another run, which differs in "
+                f"{', '.join(differ)}: "
                 "give another folder (or repeat that run's arguments to continue it)."
             )
 
@@ -144,10 +171,11 @@ class Store:
         _write(self.path(int(chunk["number"])), buffer.getvalue())
 
     def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
-        """Statistics of chunk `number` from its file; None if it is missing or cannot be used.
+        """Statistics of chunk `number` from its file; None if it is missing or cannot
+        be used.
 
-        It must have `count` samples, with `all_samples` each of them raw, too. A damaged file makes
-        a warning.
+        It must have `count` samples, with `all_samples` each of them raw, too. A
+        damaged file makes a warning.
         """
         path = self.path(number)
         if not path.exists():
@@ -156,35 +184,45 @@ class Store:
             chunk = _checked(path, self.run)
             if chunk["number"] != number:
                 raise ValueError(f"it is chunk {chunk['number']} of this run")
-        except Exception as error:  # zip, zlib, numpy: a damaged file makes all of them complain
+        # zip, zlib, numpy: a damaged file makes all of them complain
+        except Exception as error:
             text = str(error) or type(error).__name__
             warnings.warn(
-                f"'{path}' is not used, its samples are computed again: {text}.", stacklevel=2
+                f"'{path}' is not used, its samples are computed again: {text}.",
+                stacklevel=2,
             )
             return None
         complete = chunk["count"] == count
         if all_samples:
             complete = complete and len(chunk.get("raw.status", ())) == count
-        return chunk if complete else None
+        if complete:
+            return chunk
+        return None
 
 
 def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
-    """The raw samples that `monte_carlo(..., folder=..., keep_samples=True)` stored, by chunk.
+    """Samples that `monte_carlo(folder=..., keep_samples=True)` stored, by chunk.
 
     Args:
         folder: of the run.
 
     Yields:
-        `gaps` (C, m), `velocity_before` (C, n) (no columns where they are constant), `velocity`
-        (C, n) after the impact, `status` (C,); in the order of the samples.
+        `gaps` (C, m), `velocity_before` (C, n) (no columns where they are constant),
+        `velocity` (C, n) after the impact, `status` (C,); in the order of the samples.
 
     Raises:
-        FileNotFoundError: no run there. ValueError: a damaged file, or chunks without samples.
+        FileNotFoundError: no run there. ValueError: a damaged file, or chunks without
+            samples.
 
     >>> import tempfile
     >>> import jimpact as ji
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     options = {"samples": 30, "chunk": 20, "folder": folder, "keep_samples": True}
+    ...     options = {
+    ...         "samples": 30,
+    ...         "chunk": 20,
+    ...         "folder": folder,
+    ...         "keep_samples": True,
+    ...     }
     ...     speeds = ji.Uniform([1.0, 0.0], [2.0, 0.0])
     ...     _ = ji.monte_carlo(ji.Newton(0.5), ji.chain([1.0, 1.0]), speeds, **options)
     ...     [part["velocity"].shape for part in ji.read_samples(folder)]
@@ -198,12 +236,15 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
             raise ValueError(f"'{path}' cannot be used: {error}.") from None
         samples = part(chunk, "raw")
         if len(samples.get("status", ())) != chunk["count"]:
-            raise ValueError(f"'{path}' has no raw samples: run with keep_samples=True.")
+            raise ValueError(
+                f"'{path}' has no raw samples: run with keep_samples=True."
+            )
         yield samples
 
 
 def _checked(path: Path, run: str) -> Chunk:
-    """Arrays of a chunk's file by name; a ValueError unless it is of the run with the hash `run`.
+    """Arrays of a chunk's file by name; a ValueError unless it is of the run with the
+    hash `run`.
 
     zip checks the sums of their bytes.
     """
@@ -246,10 +287,14 @@ def _write(path: Path, content: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        what = "the disk is full" if full else str(error)
+        if full:
+            what = "the disk is full"
+        else:
+            what = str(error)
         raise OSError(
             error.errno,
-            f"'{path}' could not be written, {what}; what was there before is intact, and the same "
+            f"'{path}' could not be written, {what}; what was there before is intact, "
+            f"and the same "
             "call continues from it",
         ) from error
     except BaseException:  # ctrl-C

@@ -10,7 +10,12 @@ from jimpact.tools.study_tables import arguments_of, check_keys
 
 # Keys of the table, and the arguments of `monte_carlo` that they are.
 SAMPLING = {
-    **{"velocity_m_per_s": "velocity", "gaps_m": "gaps", "law": "law", "samples": "samples"},
+    **{
+        "velocity_m_per_s": "velocity",
+        "gaps_m": "gaps",
+        "law": "law",
+        "samples": "samples",
+    },
     **{"seed": "key", "chunk": "chunk", "bins": "bins"},
 }
 DISTRIBUTIONS: dict[tuple[str, ...], Callable[..., Distribution]] = {
@@ -20,7 +25,9 @@ DISTRIBUTIONS: dict[tuple[str, ...], Callable[..., Distribution]] = {
 
 
 def sampling_of(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any]:
-    """Arguments of `monte_carlo` from the table [monte_carlo]; tables in it are distributions."""
+    """Arguments of `monte_carlo` from the table [monte_carlo]; tables in it are
+    distributions.
+    """
     check_keys("[monte_carlo]", table, SAMPLING, ("velocity_m_per_s",))
     laws = table.get("law", {})
     if not isinstance(laws, dict):
@@ -37,9 +44,13 @@ def sampling_of(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, A
 
 def _distribution(key: str, table: Any) -> Distribution:
     """The distribution that a table of a study means."""
-    kind = DISTRIBUTIONS.get(tuple(sorted(table))) if isinstance(table, dict) else None
+    if isinstance(table, dict):
+        kind = DISTRIBUTIONS.get(tuple(sorted(table)))
+    else:
+        kind = None
     if kind is None:
         raise ValueError(
-            f"`{key}` in [monte_carlo] must have low and high, or mean and std, but is {table!r}."
+            f"`{key}` in [monte_carlo] must have low and high, or mean and std, but is "
+            f"{table!r}."
         )
     return kind(**table)

@@ -1,4 +1,6 @@
-"""The dynamics between impacts in kinetic quasi-velocities, and the contact problem of forces."""
+"""The dynamics between impacts in kinetic quasi-velocities, and the contact problem of
+forces.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -20,11 +22,12 @@ Constraint = Callable[[jax.Array], jax.Array]  # q -> h(q) (b,), 0 at all times
 
 
 class QuasiLagrange(NamedTuple):
-    """The terms of `qn' + F_norm = G lambda_bar`, `qt' + F_tan = 0`, bilateral constraints first.
+    """The terms of `qn' + F_norm = G lambda_bar`, `qt' + F_tan = 0`.
 
-    d = b + m: b bilateral constraints, m contacts. `normal` F_norm and `tangential` F_tan
-    [N / sqrt(kg)]; `matrix` G = n_q^T M n_q, not reduced; `norm` |grad h|, |grad f| in the metric
-    M^-1: `lambda_bar = norm * lambda`; `bilateral` b.
+    d = b + m: b bilateral constraints, which come first, then m contacts. `normal`
+    F_norm and `tangential` F_tan [N / sqrt(kg)]; `matrix` G = n_q^T M n_q, not reduced;
+    `norm` |grad h|, |grad f| in the metric M^-1: `lambda_bar = norm * lambda`;
+    `bilateral` b.
     """
 
     normal: Float[Array, " d"]
@@ -35,9 +38,11 @@ class QuasiLagrange(NamedTuple):
 
     @full_precision
     def bilateral_forces(self, force: Any = 0.0) -> Float[Array, " b"]:
-        """Forces lambda_b that hold the constraints while contacts push with `force` (m,) [N].
+        """Forces lambda_b that hold the constraints while contacts push with `force`
+        (m,) [N].
 
-        Equation: `F_norm^b = G_bb lambda_bar_b + G_bu lambda_bar_u`, (6.29) with qn_b' = 0.
+        Equation: `F_norm^b = G_bb lambda_bar_b + G_bu lambda_bar_u`, (6.29) with qn_b'
+        = 0.
         """
         b = self.bilateral
         push = as_float_array("force", force) * self.norm[b:]
@@ -45,12 +50,17 @@ class QuasiLagrange(NamedTuple):
         return jnp.linalg.solve(self.matrix[:b, :b], rest) / self.norm[:b]
 
     @full_precision
-    def rates(self, force: Any = 0.0) -> tuple[Float[Array, " d"], Float[Array, " tangential"]]:
-        """Rates qn' and qt' while contacts push with `force` (m,) [N], constraints kept.
+    def rates(
+        self, force: Any = 0.0
+    ) -> tuple[Float[Array, " d"], Float[Array, " tangential"]]:
+        """Rates qn' and qt' while contacts push with `force` (m,) [N], constraints
+        kept.
 
         Equation: `qn' = G lambda_bar - F_norm`, `qt' = -F_tan`.
         """
-        push = as_float_array("force", force) * jnp.ones_like(self.norm[self.bilateral :])
+        push = as_float_array("force", force) * jnp.ones_like(
+            self.norm[self.bilateral :]
+        )
         every = jnp.concatenate([self.bilateral_forces(push), push]) * self.norm
         return self.matrix @ every - self.normal, -self.tangential
 
@@ -65,10 +75,10 @@ def quasi_lagrange(
 ) -> QuasiLagrange:
     """The quasi-Lagrange equations of a system at one instant.
 
-    Equation: with `v = (qn, qt) = Xi(q) M(q) q'` of `ji.theory.quasi_basis`, and the acceleration
-    q''_0 without contacts, `(F_norm, F_tan) = -Xi M q''_0 - d/dt(Xi M) q'`. Contact forces change
-    qn alone; tangential ones add `n_q^T H_t lambda_t` and `t_q^T H_t lambda_t` (6.30), see
-    `ji.theory.contact_coupling`.
+    Equation: with `v = (qn, qt) = Xi(q) M(q) q'` of `ji.theory.quasi_basis`, and the
+    acceleration q''_0 without contacts, `(F_norm, F_tan) = -Xi M q''_0 - d/dt(Xi M)
+    q'`. Contact forces change qn alone; tangential ones add `n_q^T H_t lambda_t` and
+    `t_q^T H_t lambda_t` (6.30), see `ji.theory.contact_coupling`.
 
     Args:
         system: a body under loads, without a moving base; its velocities are n.
@@ -82,22 +92,34 @@ def quasi_lagrange(
         `QuasiLagrange`.
 
     Raises:
-        ValueError: redundant contacts and constraints (NaN or noise); a moving base; sizes.
+        ValueError: redundant contacts and constraints (NaN or noise); a moving base;
+            sizes.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.24)-(6.30).
 
     >>> import jimpact as ji
     >>> block = ji.System(ji.Block(1.0, 2.0**0.5, corners="base"), gravity=10.0)
     >>> terms = ji.theory.quasi_lagrange(block, [0.0, 0.5**0.5, 0.0], [1.0, 0.0, 0.0])
-    >>> [round(float(f), 6) for f in terms.normal]  # g / sqrt(W_jj), W_jj = 2: kinetic angle pi/2
+    >>> [
+    ...     round(float(f), 6) for f in terms.normal
+    ... ]  # g / sqrt(W_jj), W_jj = 2: kinetic angle pi/2
     [7.071068, 7.071068]
     """
     if system.base is not None:
-        raise ValueError("Argument `system` must not have a moving base for quasi-velocities.")
-    at, v = as_numbers("q", q), as_numbers("velocity", velocity)
+        raise ValueError(
+            "Argument `system` must not have a moving base for quasi-velocities."
+        )
+    at = as_numbers("q", q)
+    v = as_numbers("velocity", velocity)
     t = as_numbers("time", time, (), "one instant; vmap over many")
-    fixed = 0 if constraints is None else jax.eval_shape(constraints, at).shape[0]
-    chosen = None if contacts is None else tuple(contacts)
+    if constraints is None:
+        fixed = 0
+    else:
+        fixed = jax.eval_shape(constraints, at).shape[0]
+    if contacts is None:
+        chosen = None
+    else:
+        chosen = tuple(contacts)
     terms = _terms(system, constraints, chosen, at, v, t)
     return terms._replace(bilateral=fixed)  # an int: what is jitted returns arrays
 
@@ -113,8 +135,8 @@ def _terms(
 ) -> QuasiLagrange:
     """Terms F_norm, F_tan, G and norms of `QuasiLagrange`.
 
-    Equation: `(F_norm, F_tan) = -d/dt (Xi(q) M(q) q')` along q' = v, q'' = that without contacts;
-    `norm = grad f . n_q`, with n_q = `M^-1 grad f / |grad f|`.
+    Equation: `(F_norm, F_tan) = -d/dt (Xi(q) M(q) q')` along q' = v, q'' = that without
+    contacts; `norm = grad f . n_q`, with n_q = `M^-1 grad f / |grad f|`.
     """
     body = system.body
 
@@ -125,17 +147,23 @@ def _terms(
         if contacts is not None:
             normals = normals[:, jnp.array(contacts)]
         if constraints is not None:
-            gradient = jax.jacfwd(lambda u: constraints(body.nearby(at, u)))(jnp.zeros_like(v))
+            gradient = jax.jacfwd(lambda u: constraints(body.nearby(at, u)))(
+                jnp.zeros_like(v)
+            )
             normals = jnp.concatenate([gradient.T, normals], axis=1)
         return Scene(body.mass_matrix(at), normals)
 
     def quasi(s: Float[Array, ""], w: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Quasi-velocities `Xi M w` after the time s at the velocity v, first order in s."""
+        """Quasi-velocities `Xi M w` after the time s at the velocity v, first order in
+        s.
+        """
         scene = scene_at(s * v)
         return jnp.concatenate(quasi_basis(scene), axis=1).T @ momentum(scene, w)
 
     scene = scene_at(jnp.zeros_like(v))
-    free = free_acceleration(system, q, v, user_force(system, q, v, t), mass_at(system, q))
+    free = free_acceleration(
+        system, q, v, user_force(system, q, v, t), mass_at(system, q)
+    )
     zero = jnp.zeros((), v.dtype)
     # derivative at s = 0 along (1, q''): d/dt (Xi M q')
     _, rate = jax.jvp(quasi, (zero, v), (jnp.ones_like(zero), free))
@@ -150,14 +178,17 @@ def _terms(
 class ContactProblem(NamedTuple):
     """`0 <= lambda  _|_  f'' = D lambda + B >= 0` at contacts that stay closed.
 
-    `delassus` D [1/kg]; `free` B(q, q') [m/s^2], gap accelerations without contact forces.
+    `delassus` D [1/kg]; `free` B(q, q') [m/s^2], gap accelerations without contact
+    forces.
     """
 
     delassus: Float[Array, "m m"]
     free: Float[Array, " m"]
 
     def forces(self, closed: Any = True) -> Float[Array, " m"]:
-        """Forces lambda [N] at the contacts that are `closed` (m,), with gap velocity 0."""
+        """Forces lambda [N] at the contacts that are `closed` (m,), with gap velocity
+        0.
+        """
         held = jnp.broadcast_to(jnp.asarray(closed, bool), self.free.shape)
         return _forces(self.delassus, self.free, held)
 
@@ -166,13 +197,17 @@ class ContactProblem(NamedTuple):
 def _forces(
     delassus: Float[Array, "m m"], free: Float[Array, " m"], held: Bool[Array, " m"]
 ) -> Float[Array, " m"]:
-    """Forces of `0 <= lambda _|_ D lambda + B >= 0` over held contacts, 0 at others [N]."""
+    """Forces of `0 <= lambda _|_ D lambda + B >= 0` over held contacts, 0 at others
+    [N].
+    """
     both = held[:, None] & held[None, :]
     unit = jnp.eye(len(held), dtype=free.dtype)
     return solve_lcp(jnp.where(both, delassus, unit), jnp.where(held, free, 1.0)).z
 
 
-def contact_problem(system: System, q: Any, velocity: Any, time: Any = 0.0) -> ContactProblem:
+def contact_problem(
+    system: System, q: Any, velocity: Any, time: Any = 0.0
+) -> ContactProblem:
     """The complementarity problem of contact forces, without friction.
 
     Equation: `D = grad f^T M^-1 grad f`,
@@ -193,7 +228,8 @@ def contact_problem(system: System, q: Any, velocity: Any, time: Any = 0.0) -> C
 
     Differentiable where no contact is about to lose its force.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), 6.3.2.2 (the contact LCP of the rocking block).
+    Source: Brogliato, Nonsmooth Mechanics (2016), 6.3.2.2 (the contact LCP of the
+    rocking block).
 
     >>> import jimpact as ji
     >>> block = ji.System(ji.Block(1.0, 2.0, corners="base"), gravity=10.0)

@@ -1,4 +1,6 @@
-"""Motions in which contact forces of a `Compliant` law act, instead of impacts at an instant."""
+"""Motions in which contact forces of a `Compliant` law act, instead of impacts at an
+instant.
+"""
 
 from functools import partial
 from typing import NamedTuple
@@ -67,8 +69,9 @@ from jimpact.numerics.driver import until_over
 from jimpact.tools.loops import any_lane
 from jimpact.tools.status import CODE
 
-# Of the cone: contacts that have reached its rim stick only if others take over more than this.
-# Ten times more: contacts that share what they hold slide one after the other.
+# Of the cone: contacts that have reached its rim stick only if others take over more
+# than this. Ten times more: contacts that share what they hold slide one after the
+# other.
 WITHIN = 1e-6
 
 
@@ -76,20 +79,22 @@ class _CompliantRun(NamedTuple):
     """A motion with contact forces up to now."""
 
     flight: Flight
-    fastest: Float[Array, " s"]  # [m/s] largest approach (m) so far, with friction slip (m), too
+    # [m/s] largest approach (m) so far, with friction slip (m), too
+    fastest: Float[Array, " s"]
     table: MotionTable
     event_count: Int[Array, ""]
     status: Int[Array, ""]
     apart: Bool[Array, ""]  # all contacts are open and none closes
-    vanished: Float[Array, ""]  # [s] when steps last vanished at an end of slip, -inf before
+    # [s] when steps last vanished at an end of slip, -inf before
+    vanished: Float[Array, ""]
 
 
 def force_of(law: Law) -> Force:
     """The contact force of a law, for motions.
 
     Raises:
-        TypeError: a law without one, or whose force yields: motions do not keep what that depends
-            on.
+        TypeError: a law without one, or whose force yields: motions do not keep what
+            that depends on.
     """
     force: Force | None = law.contact_force
     if force is None or not law.uses_gaps:
@@ -99,39 +104,57 @@ def force_of(law: Law) -> Force:
         )
     if getattr(law, "tangential_stiffness", None) is not None:
         raise TypeError(
-            "Argument `law` must have no `tangential_stiffness` in a motion by contact forces, but "
-            f"is {law!r}: by events each impact has its springs, which begin with xi = 0."
+            "Argument `law` must have no `tangential_stiffness` in a motion by contact "
+            "forces, but "
+            f"is {law!r}: by events each impact has its springs, which begin with xi = "
+            f"0."
         )
     if force.bound is not None:
         raise TypeError(
-            "Argument `law` must have a force without bound in a motion: what yields is for "
+            "Argument `law` must have a force without bound in a motion: what yields "
+            "is for "
             f"`impact`, but the force is {force!r}."
         )
     return force
 
 
-def compliant_motion(problem: MotionProblem, max_events: int, until_apart: bool) -> Course:
-    """The motion from `times[0]` to `times[-1]`, or until all contacts are open and none closes."""
+def compliant_motion(
+    problem: MotionProblem, max_events: int, until_apart: bool
+) -> Course:
+    """The motion from `times[0]` to `times[-1]`, or until all contacts are open and
+    none closes.
+    """
     run = partial(_run, max_events, until_apart)
     return course_of(problem, _start(problem), run)[0]
 
 
 def _start(problem: MotionProblem) -> State:
-    """State at the beginning: indentations `x = -f`, 0 of closed gaps; no impulses yet."""
+    """State at the beginning: indentations `x = -f`, 0 of closed gaps; no impulses
+    yet.
+    """
     gap = gaps(problem.system, problem.q0, problem.times[0])
     x = jnp.where(jnp.abs(gap) <= problem.settings.closed_below, 0.0, -gap)
-    each = 0 if problem.mu is None else problem.tangents // problem.contacts
+    if problem.mu is None:
+        each = 0
+    else:
+        each = problem.tangents // problem.contacts
     impulses = jnp.zeros((1 + each, len(x)), x.dtype)
     return problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
 
 
 def _run(max_events: int, until_apart: bool, problem: MotionProblem) -> MotionEnd:
-    """Pass after pass until the last sample, a failure, or, `until_apart`, all contacts open."""
+    """Pass after pass until the last sample, a failure, or, `until_apart`, all contacts
+    open.
+    """
 
     def continues(problem: MotionProblem, run: _CompliantRun) -> Bool[Array, ""]:
-        """True while the motion goes on, and contacts are not apart where that ends it."""
+        """True while the motion goes on, and contacts are not apart where that ends
+        it.
+        """
         on = goes_on(problem, run)
-        return on & ~run.apart if until_apart else on
+        if until_apart:
+            return on & ~run.apart
+        return on
 
     one = partial(_one_pass, max_events)
     last = until_over(continues, one, problem, _begin(problem, max_events))
@@ -141,25 +164,31 @@ def _run(max_events: int, until_apart: bool, problem: MotionProblem) -> MotionEn
 def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     """Run at the start of the motion: phases follow from gaps and gap velocities.
 
-    Compression where the indentation x > 0, or x = 0 and the contact does not open; expansion where
-    x > 0 and it opens, of a force that has this phase; else open.
+    Compression where the indentation x > 0, or x = 0 and the contact does not open;
+    expansion where x > 0 and it opens, of a force that has this phase; else open.
     """
     system, force, mu, _, _, _, times, m, _ = problem
     state = _start(problem)
     gamma, slip = _rates(problem, state)
     x = state.contact[0]
-    phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), Phase.COMPRESSION, Phase.OPEN)
+    phase = jnp.where(
+        (x > 0) | ((x == 0) & (gamma <= 0)), Phase.COMPRESSION, Phase.OPEN
+    )
     if not force.slackens:
         phase = jnp.where((x > 0) & (gamma > 0), Phase.EXPANSION, phase)
-    phase, margins, fastest = phase.astype(jnp.int32), 2 * m, jnp.maximum(-gamma, 0.0)
+    phase = phase.astype(jnp.int32)
+    margins = 2 * m
+    fastest = jnp.maximum(-gamma, 0.0)
     if mu is not None:
         phase = mode_rows(ContactModes(phase, no_modes(m, x.dtype)))
-        margins, fastest = 3 * m, jnp.concatenate([fastest, slip])
+        margins = 3 * m
+        fastest = jnp.concatenate([fastest, slip])
     flight = first_flight(system, state, phase[:, None], margins, times)
     contacts = contacts_at(system, state.q, state.v, state.t, False)
     stable = stable_step(force, flight.aim.modes, contacts, state)
     flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
-    flight = flight._replace(event=flight.event.at[:m].set(True))  # friction is to be decided
+    # friction is to be decided
+    flight = flight._replace(event=flight.event.at[:m].set(True))
     return _CompliantRun(
         flight=flight,
         fastest=jax.lax.stop_gradient(fastest),
@@ -171,42 +200,56 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     )
 
 
-def _rates(problem: MotionProblem, at: State) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+def _rates(
+    problem: MotionProblem, at: State
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Gap velocities f' and speeds of slip |u| [m/s], these 0 without friction."""
-    normal, tangent = kinematics(problem.system, at.q, at.v, at.t, problem.mu is not None)
+    normal, tangent = kinematics(
+        problem.system, at.q, at.v, at.t, problem.mu is not None
+    )
     if tangent is None:
         return normal.rate, jnp.zeros_like(normal.rate)
     return normal.rate, length(by_contact(tangent.rate, problem.contacts))
 
 
 def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
-    """Run with new modes of friction after an event: contacts whose force acts stick or slide.
+    """Run with new modes of friction after an event: contacts whose force acts stick or
+    slide.
 
-    Contacts with slip slide. All others stick if forces with normal forces F of the law hold them:
-    `|a_t| <= within` at `|lambda_t| <= mu F`; else modes solve `choose_with_friction` for given
-    normal forces. Without an event modes remain.
+    Contacts with slip slide. All others stick if forces with normal forces F of the law
+    hold them: `|a_t| <= within` at `|lambda_t| <= mu F`; else modes solve
+    `choose_with_friction` for given normal forces. Without an event modes remain.
     """
     system, force, mu, settings, *_ = problem
     if mu is None:
         return run
-    at, m, event = run.flight.state, problem.contacts, run.flight.event
+    at = run.flight.state
+    m = problem.contacts
+    event = run.flight.event
 
     def decided() -> tuple[Int[Array, "k 1"], Bool[Array, ""]]:
         """Rows of the new modes, and true if they are consistent."""
         phase, before = contact_modes(run.flight.aim.modes, at)
         contacts = contacts_at(system, at.q, at.v, at.t, True)
-        pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))  # by F
-        scale, slip = jnp.max(run.fastest), _rates(problem, at)[1]
+        # by F
+        pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))
+        scale = jnp.max(run.fastest)
+        slip = _rates(problem, at)[1]
         stopped = slip_stops(settings, before, event[2 * m :], slip, scale)
-        let_go = (event[2 * m :] & before.stick) | stopped  # friction has reached its limit
+        # friction has reached its limit
+        let_go = (event[2 * m :] & before.stick) | stopped
         released = jnp.concatenate([jnp.zeros_like(let_go), let_go])
-        fastest = jnp.max(jnp.abs(pushed.approach))  # largest acceleration: a share is rounding
-        rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(settings, fastest)
-        slides, slack = (slip > rest) & ~stopped, rest_acceleration(slip.dtype) * fastest
+        # largest acceleration: a share is rounding
+        fastest = jnp.max(jnp.abs(pushed.approach))
+        rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(
+            settings, fastest
+        )
+        slides = (slip > rest) & ~stopped
+        slack = rest_acceleration(slip.dtype) * fastest
         acts = loaded(phase)
         choice = choose_with_friction(pushed, mu, before, acts, released, slides, slack)
-        # corners that sink in differently are nearly redundant: they stick where the forces of the
-        # flow, which share what they hold, can hold them
+        # corners that sink in differently are nearly redundant: they stick where the
+        # forces of the flow, which share what they hold, can hold them
         assert pushed.tangent is not None
         moves = direction(by_contact(pushed.tangent.rate, m))  # of the slip
         sticking = Modes(acts, acts & ~slides, jnp.where(slides, moves[:, 0], 1.0))
@@ -223,46 +266,69 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))
         sticks = jnp.all(~sticking.stick | holds)
         chosen = selected(sticks, sticking, choice.modes)
-        if settings.spatial:  # a force that changes as fast as in a contact has slip begin at once
+        # a force that changes as fast as in a contact has slip begin at once
+        if settings.spatial:
             chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
-        return mode_rows(ContactModes(phase, chosen))[:, None], choice.consistent | sticks
+        return mode_rows(ContactModes(phase, chosen))[
+            :, None
+        ], choice.consistent | sticks
 
     old = run.flight.aim.modes, jnp.asarray(True)
     happened = jnp.any(event)
     new = jax.lax.cond(any_lane(happened), decided, lambda: old)
     modes, consistent = selected(happened, new, old)
-    status = jnp.where(consistent, run.status, CODE["no_contact_force"]).astype(jnp.int32)
+    status = jnp.where(consistent, run.status, CODE["no_contact_force"]).astype(
+        jnp.int32
+    )
     aim = run.flight.aim._replace(modes=modes)
     return run._replace(flight=run.flight._replace(aim=aim), status=status)
 
 
-def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
-    """Run after one pass of the stepper, with its state as next sample, and its event if any.
+def _one_pass(
+    max_events: int, problem: MotionProblem, run: _CompliantRun
+) -> _CompliantRun:
+    """Run after one pass of the stepper, with its state as next sample, and its event
+    if any.
 
-    Events: contacts that close or open, and friction that turns from sticking to slip or stops.
+    Events: contacts that close or open, and friction that turns from sticking to slip
+    or stops.
     """
     run = _with_friction(problem, run)
-    system, times, flight, m = problem.system, problem.times, run.flight, problem.contacts
+    system = problem.system
+    times = problem.times
+    flight = run.flight
+    m = problem.contacts
     flow = compliant_flow(problem, flight.state, flight.aim.modes, run.fastest)
     settings = problem.settings
-    # errors of time and works, then of indentations and impulses by the scales of the contacts
-    ledger = allowed_errors(system, settings, flight.state, 1.0)[: -flight.state.contact.size]
-    depth, impulse = flow.scales.depth, flow.scales.impulse
+    # errors of time and works, then of indentations and impulses by the scales of the
+    # contacts
+    ledger = allowed_errors(system, settings, flight.state, 1.0)[
+        : -flight.state.contact.size
+    ]
+    depth = flow.scales.depth
+    impulse = flow.scales.impulse
     sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
     allowed = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
     flown, _ = one_pass(flow, settings, allowed, times, flight)
-    before, after = flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
-    was_open, is_open = before == Phase.OPEN, after == Phase.OPEN
-    closed, opened = was_open & ~is_open, ~was_open & is_open
+    before = flight.aim.modes[:m, 0]
+    after = flown.aim.modes[:m, 0]
+    was_open = before == Phase.OPEN
+    is_open = after == Phase.OPEN
+    closed = was_open & ~is_open
+    opened = ~was_open & is_open
     gamma, slip = _rates(problem, flown.state)
-    fastest, none = jnp.maximum(-gamma, 0.0), jnp.zeros(m, bool)
-    turned, stopped, vanished = none, none, run.vanished
+    fastest = jnp.maximum(-gamma, 0.0)
+    none = jnp.zeros(m, bool)
+    turned = none
+    stopped = none
+    vanished = run.vanished
     if problem.mu is not None:
         friction = contact_modes(flight.aim.modes, flown.state).friction
         flown, vanished = _ended_slip(problem, run, flown, friction, slip)
         fired = flown.event[2 * m :]
         stopped = slip_stops(settings, friction, fired, slip, flow.scales.slip)
-        turned, fastest = (fired & friction.stick) | stopped, jnp.concatenate([fastest, slip])
+        turned = (fired & friction.stick) | stopped
+        fastest = jnp.concatenate([fastest, slip])
         flown = flown._replace(state=flow.stopped(stopped, flown.state))
     at = flown.state
     happened = jnp.any(closed | opened | turned)
@@ -293,15 +359,18 @@ def _ended_slip(
     friction: Modes,
     slip: Float[Array, " m"],
 ) -> tuple[Flight, Float[Array, ""]]:
-    """Flight in which slip of at most STOPPED of the scale ends where steps vanish, and that time.
+    """Flight in which slip of at most STOPPED of the scale ends where steps vanish, and
+    that time.
 
     `friction`: modes of the step; `slip`: its speeds [m/s] at the end. The time [s] is
     `run.vanished` unless this happens now; not twice at one instant.
 
-    A body that turns on one corner drags another through its end of slip. There friction turns
-    round at once, and with it the force that holds the first corner: no step lands on its cone.
+    A body that turns on one corner drags another through its end of slip. There
+    friction turns round at once, and with it the force that holds the first corner: no
+    step lands on its cone.
     """
-    m, most = problem.contacts, problem.settings.max_steps
+    m = problem.contacts
+    most = problem.settings.max_steps
     scale = jnp.maximum(jnp.max(run.fastest), jnp.max(slip))
     ends = friction.active & ~friction.stick & (slip <= STOPPED * scale)
     vanished = flown.stuck & (flown.steps < most) & (flown.state.t > run.vanished)
@@ -312,10 +381,15 @@ def _ended_slip(
     return selected(here, again, flown), jnp.where(here, flown.state.t, run.vanished)
 
 
-def _event(problem: MotionProblem, at: State, opened: Bool[Array, " m"]) -> Float[Array, " w"]:
-    """Row of an event: impulses of contacts that have `opened`; velocities do not jump."""
+def _event(
+    problem: MotionProblem, at: State, opened: Bool[Array, " m"]
+) -> Float[Array, " w"]:
+    """Row of an event: impulses of contacts that have `opened`; velocities do not
+    jump.
+    """
     none = no_jump(at, problem.contacts, problem.tangents)
-    zero, (push, *tangential) = jnp.zeros_like(at.t), jnp.where(opened, at.contact[1:], 0.0)
+    zero = jnp.zeros_like(at.t)
+    push, *tangential = jnp.where(opened, at.contact[1:], 0.0)
     jump = none._replace(impulse=push)
     if tangential:
         jump = jump._replace(tangential=jnp.stack(tangential, axis=1).reshape(-1))

@@ -1,4 +1,6 @@
-"""Motion under the contact forces of a `Compliant` law, between events, and when these come."""
+"""Motion under the contact forces of a `Compliant` law, between events, and when these
+come.
+"""
 
 from typing import NamedTuple
 
@@ -39,14 +41,16 @@ from jimpact.motion.tables import MotionProblem
 from jimpact.motion.transitions import velocity_noise
 from jimpact.numerics.stepper import any_of
 
-# Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
-# of the tolerance.
+# Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off
+# by a tenth of the tolerance.
 SNAP = 1e-2
-# Longest step, in the time in which the stiffest or most damped contact moves by one radian. Of a
-# body at rest on its springs steps see no error. Ten times more: derivatives of its oscillations
-# are wrong; a hundred times more: they grow by 1e11 in a step.
+# Longest step, in the time in which the stiffest or most damped contact moves by one
+# radian. Of a body at rest on its springs steps see no error. Ten times more:
+# derivatives of its oscillations are wrong; a hundred times more: they grow by 1e11 in
+# a step.
 STABLE = 0.5
-SLOWEST = 1e-12  # [m/s] scale of contacts that have not moved yet; any small one would do
+# [m/s] scale of contacts that have not moved yet; any small one would do
+SLOWEST = 1e-12
 
 
 class ContactScales(NamedTuple):
@@ -61,36 +65,48 @@ class ContactScales(NamedTuple):
 
 
 class ContactModes(NamedTuple):
-    """Phase of each contact, and its mode of friction, which is active while the force acts."""
+    """Phase of each contact, and its mode of friction, which is active while the force
+    acts.
+    """
 
     phase: Int[Array, " m"]  # `contact_flow.Phase`: open, compression, expansion, slack
     friction: Modes
 
 
-def _contact_scales(force: Force, contacts: Contacts, fastest: Float[Array, " s"]) -> ContactScales:
-    """Scales of contacts from their largest gap velocities, and slips after them [m/s] (m or 2 m).
+def _contact_scales(
+    force: Force, contacts: Contacts, fastest: Float[Array, " s"]
+) -> ContactScales:
+    """Scales of contacts from their largest gap velocities, and slips after them [m/s]
+    (m or 2 m).
 
-    Equation: the indentation x that stores the energy `speed^2 / (2 W_jj)`, the force F(x, 0), the
-    impulse `speed / W_jj`.
+    Equation: the indentation x that stores the energy `speed^2 / (2 W_jj)`, the force
+    F(x, 0), the impulse `speed / W_jj`.
     """
     m = len(contacts.normal.rate)
-    w, slip = jnp.diagonal(contacts.delassus)[:m], jnp.maximum(jnp.max(fastest), SLOWEST)
+    w = jnp.diagonal(contacts.delassus)[:m]
+    slip = jnp.maximum(jnp.max(fastest), SLOWEST)
     speed = jnp.maximum(fastest[:m], SLOWEST)
     depth = force.indentation_scale(0.5 * speed**2 / w)
-    push, onset = force.force(depth, jnp.zeros_like(depth)), force.onset_scale(depth, speed)
-    return jax.lax.stop_gradient(ContactScales(speed, depth, push, onset, speed / w, slip))
+    push = force.force(depth, jnp.zeros_like(depth))
+    onset = force.onset_scale(depth, speed)
+    return jax.lax.stop_gradient(
+        ContactScales(speed, depth, push, onset, speed / w, slip)
+    )
 
 
 class CompliantFlow(MotionFlow):
-    """Flow with contact forces; each contact is open, in compression, in expansion, or slack.
+    """Flow with contact forces; each contact is open, in compression, in expansion, or
+    slack.
 
-    Equation: `M q'' = (loads) + N F(x, x') + H lambda_t`, `x' = -f'` (in expansion `-f' / e^2`);
-    `lambda_t` holds contacts that stick (`h'' = 0`), and is `-mu F u / |u|` at those that slide.
+    Equation: `M q'' = (loads) + N F(x, x') + H lambda_t`, `x' = -f'` (in expansion
+    `-f' / e^2`); `lambda_t` holds contacts that stick (`h'' = 0`), and is
+    `-mu F u / |u|` at those that slide.
 
-    The indentation x is a row of the state, -gap before the contact first closes: a plastic contact
-    keeps a residual indentation, at which it closes again. Modes (rows): the phase of each contact,
-    as in `events/contact_flow.py`; with friction whether it sticks and the sign of its sliding.
-    Margins: by indentation, then by velocity, then what is left of the cone or of slip.
+    The indentation x is a row of the state, -gap before the contact first closes: a
+    plastic contact keeps a residual indentation, at which it closes again. Modes
+    (rows): the phase of each contact, as in `events/contact_flow.py`; with friction
+    whether it sticks and the sign of its sliding. Margins: by indentation, then by
+    velocity, then what is left of the cone or of slip.
     """
 
     force: Force
@@ -123,17 +139,20 @@ class CompliantFlow(MotionFlow):
     ) -> Float[Array, "rows 1"]:
         """Rates of q, v, t, of the works, and of each contact: indentation, impulses.
 
-        Equation: as of the class; powers `F . v` of loads, `lambda_n f'` and `lambda_t . u` of
-        contacts; `x' = -f'`, p' = lambda.
+        Equation: as of the class; powers `F . v` of loads, `lambda_n f'` and
+        `lambda_t . u` of contacts; `x' = -f'`, p' = lambda.
         """
         at = unpacked(self.like, y)
         contacts, force = self.contact_forces(const, at)
-        gamma, push = contacts.normal.rate, force.normal
+        gamma = contacts.normal.rate
+        push = force.normal
         closing = _unloading(self.force, const.phase, -gamma)
         friction, base = contact_powers(self.system, contacts, force, at.t)
         remembered = [closing, push]
         if force.tangential is not None:
-            remembered.extend(by_contact(self.along_tangents(force.tangential), len(push)).T)
+            remembered.extend(
+                by_contact(self.along_tangents(force.tangential), len(push)).T
+            )
         rates = State(
             q=self.system.body.rates(at.q, at.v),
             v=force.acceleration,
@@ -155,11 +174,15 @@ class CompliantFlow(MotionFlow):
     def margins(
         self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
     ) -> Float[Array, "margins 1"]:
-        """Rows of `_normal_margins`, with friction of `friction_margins`, and of the sample."""
+        """Rows of `_normal_margins`, with friction of `friction_margins`, and of the
+        sample.
+        """
         at = unpacked(self.like, y)
         if self.mu is None:
             rate = kinematics(self.system, at.q, at.v, at.t)[0].rate
-            return self.from_margins(self._normal_margins(const.phase, rate, at.contact[0]), at)
+            return self.from_margins(
+                self._normal_margins(const.phase, rate, at.contact[0]), at
+            )
         contacts, force = self.contact_forces(const, at)
         normal = self._normal_margins(const.phase, contacts.normal.rate, at.contact[0])
         zero = jnp.zeros_like(at.t)
@@ -171,7 +194,8 @@ class CompliantFlow(MotionFlow):
     def _normal_margins(
         self, const: Int[Array, " m"], rate: Float[Array, " m"], x: Float[Array, " m"]
     ) -> Float[Array, " 2*m"]:
-        """Margins of phases `const`: m by the indentation x [m], then m by the gap velocity [m/s].
+        """Margins of phases `const`: m by the indentation x [m], then m by the gap
+        velocity [m/s].
 
         | phase | by x | by gap velocity |
         |---|---|---|
@@ -179,13 +203,16 @@ class CompliantFlow(MotionFlow):
         | compression | 1 | -f': it turns to expansion |
         | expansion | x: it opens | f': it is compressed again |
 
-        With a force that may vanish at x > 0 (`slackens`) the first margin is `Force.onset` in
-        compression, minus that where slack, and the second one x: the contact opens at x = 0. All
-        are in units of the scales.
+        With a force that may vanish at x > 0 (`slackens`) the first margin is
+        `Force.onset` in compression, minus that where slack, and the second one x: the
+        contact opens at x = 0. All are in units of the scales.
         """
-        gamma, depth = rate / self.scales.speed, x / self.scales.depth
+        gamma = rate / self.scales.speed
+        depth = x / self.scales.depth
         if self.force.slackens:
-            onset = self.force.onset(jnp.where(x >= 0, x, 0.0), -rate) / self.scales.onset
+            onset = (
+                self.force.onset(jnp.where(x >= 0, x, 0.0), -rate) / self.scales.onset
+            )
             by_x = jnp.where(const == Phase.COMPRESSION, onset, -onset)
             by_g = depth
         else:
@@ -195,7 +222,9 @@ class CompliantFlow(MotionFlow):
         return jnp.concatenate([by_x, jnp.where(const == Phase.OPEN, 1.0, by_g)])
 
     def rooted(self, modes: Int[Array, "k 1"]) -> Bool[Array, "margins 1"]:
-        """True for margins of opening: landings on them step in the root of the indentation."""
+        """True for margins of opening: landings on them step in the root of the
+        indentation.
+        """
         phase = self.constants(modes).phase[:, None]
         opens = phase == Phase.EXPANSION
         by_g = (phase == Phase.COMPRESSION) & self.force.slackens
@@ -208,14 +237,17 @@ class CompliantFlow(MotionFlow):
         y: Float[Array, "rows 1"],
         which: Bool[Array, "margins 1"],
     ) -> tuple[Int[Array, "k 1"], Float[Array, "rows 1"]]:
-        """Modes and state after the events `which`; a contact that closes or opens has x = 0.
+        """Modes and state after the events `which`; a contact that closes or opens has
+        x = 0.
 
-        Phases change as `_normal_margins` says; friction that sets in with a force is decided by
-        `compliant_contact`.
+        Phases change as `_normal_margins` says; friction that sets in with a force is
+        decided by `compliant_contact`.
         """
-        at, (phase, friction) = unpacked(self.like, y), self.constants(modes)
+        at = unpacked(self.like, y)
+        phase, friction = self.constants(modes)
         m = len(phase)
-        by_x, by_g = which[:m, 0], which[m : 2 * m, 0]
+        by_x = which[:m, 0]
+        by_g = which[m : 2 * m, 0]
         closed = by_x & (phase == Phase.OPEN)
         if self.force.slackens:
             after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
@@ -224,12 +256,17 @@ class CompliantFlow(MotionFlow):
         else:
             turned = by_g & (phase == Phase.COMPRESSION)
             after = jnp.where(turned, Phase.EXPANSION, phase)
-            after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)
+            after = jnp.where(
+                by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after
+            )
             opened = by_x & (phase == Phase.EXPANSION)
             if self.force.bistiffness is not None:  # e = 0 returns nothing
                 opened = opened | (turned & (self.force.bistiffness.restitution == 0))
-        after = jnp.where(opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after))
-        x, impulses = at.contact[:1], at.contact[1:]
+        after = jnp.where(
+            opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after)
+        )
+        x = at.contact[:1]
+        impulses = at.contact[1:]
         indentation = jnp.where(opened | closed, 0.0, x)
         contact = jnp.concatenate([indentation, jnp.where(closed, 0.0, impulses)])
         rows = after
@@ -237,18 +274,30 @@ class CompliantFlow(MotionFlow):
             keeps = loaded(phase) & loaded(after)
             rows = mode_rows(ContactModes(after, friction._replace(active=keeps)))
         state = packed(at._replace(contact=contact))
-        state = jnp.concatenate([state, y[len(state) :]])  # `error_only_rows` stay as they are
+        # `error_only_rows` stay as they are
+        state = jnp.concatenate([state, y[len(state) :]])
         return rows[:, None].astype(modes.dtype), state
 
-    def begins(self, before: Int[Array, "k 1"], after: Int[Array, "k 1"]) -> Bool[Array, "1 1"]:
-        """True where the force of a contact sets in: it was open or slack, and is compressed."""
+    def begins(
+        self, before: Int[Array, "k 1"], after: Int[Array, "k 1"]
+    ) -> Bool[Array, "1 1"]:
+        """True where the force of a contact sets in: it was open or slack, and is
+        compressed.
+        """
         before, after = (self.constants(x).phase[:, None] for x in (before, after))
         free = (before == Phase.OPEN) | (before == Phase.SLACK)
         return any_of((after == Phase.COMPRESSION) & free)
 
-    def projected(self, const: ContactModes, at: State) -> tuple[State, Bool[Array, " none"]]:
-        """State without slip of contacts that stick, see `without_slip`; no normal jumps here."""
-        new = at if self.mu is None else self.without_slip(const.friction, at)
+    def projected(
+        self, const: ContactModes, at: State
+    ) -> tuple[State, Bool[Array, " none"]]:
+        """State without slip of contacts that stick, see `without_slip`; no normal
+        jumps here.
+        """
+        if self.mu is None:
+            new = at
+        else:
+            new = self.without_slip(const.friction, at)
         return new, jnp.zeros(0, bool)
 
     def stopped(self, which: Bool[Array, " m"], at: State) -> State:
@@ -257,19 +306,27 @@ class CompliantFlow(MotionFlow):
         return self.without_slip(Modes(which, which, one), at, straight=False)
 
     def without_slip(self, modes: Modes, at: State, straight: bool = True) -> State:
-        """State in which contacts that stick have slip 0: `v += M^-1 H p`, the least change by M.
+        """State in which contacts that stick have slip 0: `v += M^-1 H p`, the least
+        change by M.
 
-        Where `straight`, slip across its direction is set to 0, too, of contacts whose slip begins
-        or ends in this step.
+        Where `straight`, slip across its direction is set to 0, too, of contacts whose
+        slip begins or ends in this step.
         """
         contacts = self.contacts(at)
         known = with_normal_forces(contacts, jnp.zeros_like(contacts.normal.rate))
         assert known.tangent is not None
-        rates = jnp.concatenate([jnp.zeros_like(contacts.normal.rate), known.tangent.rate])
+        rates = jnp.concatenate(
+            [jnp.zeros_like(contacts.normal.rate), known.tangent.rate]
+        )
         if straight and self.axes is not None:
             modes = straightened(self.axes, modes, known.tangent.rate)
-        acts = modes.stick | (modes.sign == BEGINS) if straight else modes.stick
-        p = constraint_impulse(known, self.mu, modes._replace(active=modes.active & acts), rates)
+        if straight:
+            acts = modes.stick | (modes.sign == BEGINS)
+        else:
+            acts = modes.stick
+        p = constraint_impulse(
+            known, self.mu, modes._replace(active=modes.active & acts), rates
+        )
         return at._replace(v=at.v + contacts.moved @ p)
 
 
@@ -288,7 +345,9 @@ def normal_forces(
 
 
 def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
-    """Phases and modes of friction from their rows: phase (m), with friction stick, sign (3 m)."""
+    """Phases and modes of friction from their rows: phase (m), with friction stick,
+    sign (3 m).
+    """
     m = like.contact_work.shape[1]
     phase = modes[:m, 0]
     none = no_modes(m, like.q.dtype)
@@ -300,24 +359,31 @@ def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
 
 
 def mode_rows(now: ContactModes) -> Int[Array, " rows"]:
-    """Rows (3 m) of phases and of friction: phase, stick, sign; both 0 where no friction acts."""
+    """Rows (3 m) of phases and of friction: phase, stick, sign; both 0 where no
+    friction acts.
+    """
     friction = jnp.stack([x.astype(jnp.int32) for x in now.friction[1:]])
     friction = jnp.where(now.friction.active, friction, 0)
     return jnp.concatenate([now.phase.astype(jnp.int32), *friction])
 
 
 def compliant_flow(
-    problem: MotionProblem, at: State, modes: Int[Array, "k 1"], fastest: Float[Array, " s"]
+    problem: MotionProblem,
+    at: State,
+    modes: Int[Array, "k 1"],
+    fastest: Float[Array, " s"],
 ) -> CompliantFlow:
-    """Flow from this state on; `fastest`: largest approach, then slip, of each contact [m/s].
+    """Flow from this state on; `fastest`: largest approach, then slip, of each contact
+    [m/s].
 
-    Roundings of margins: SNAP of the tolerance, or velocities that arise within the rounding of
-    time; of friction a share of the largest force or slip.
+    Roundings of margins: SNAP of the tolerance, or velocities that arise within the
+    rounding of time; of friction a share of the largest force or slip.
     """
     system, force, mu, settings, _, _, times, m, _ = problem
     contacts = contacts_at(system, at.q, at.v, at.t, mu is not None)
     scales = _contact_scales(force, contacts, fastest)
-    axes, by_depth = None, jnp.full(m, SNAP * settings.rtol, at.q.dtype)
+    axes = None
+    by_depth = jnp.full(m, SNAP * settings.rtol, at.q.dtype)
     noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
     rounding = jnp.concatenate([by_depth, jnp.maximum(by_depth, noise / scales.speed)])
     if mu is not None:
@@ -329,9 +395,12 @@ def compliant_flow(
         largest = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
         by_slip = now.active & ~now.stick
         rest = rest_acceleration(at.q.dtype)
-        friction = jnp.where(by_slip, jnp.maximum(rest * scales.slip, noise), rest * largest)
+        friction = jnp.where(
+            by_slip, jnp.maximum(rest * scales.slip, noise), rest * largest
+        )
         rounding = jnp.concatenate([rounding, friction])
-    rounded, longest = roundings(rounding, times), longest_step(system, times)
+    rounded = roundings(rounding, times)
+    longest = longest_step(system, times)
     longest = jnp.minimum(longest, stable_step(force, modes, contacts, at))
     blank = jnp.zeros((len(packed(at)), 1), at.q.dtype)
     return CompliantFlow(
@@ -352,13 +421,17 @@ def compliant_flow(
 def stable_step(
     force: Force, modes: Int[Array, "k 1"], contacts: Contacts, at: State
 ) -> Float[Array, ""]:
-    """Longest stable step [s] with the stiffness dF/dx and damping dF/dx' of loaded contacts.
+    """Longest stable step [s] with the stiffness dF/dx and damping dF/dx' of loaded
+    contacts.
 
     Equation: `STABLE / max(omega, delta)`, bounds by row sums of |W|:
     `omega^2 = max_i sum_j |W_ij| dF_j/dx`, `delta = max_i sum_j |W_ij| dF_j/dx'`.
     """
-    x, rate, m = at.contact[0], -contacts.normal.rate, len(at.contact[0])
-    phase, one = modes[:m, 0], jnp.ones_like(x)
+    x = at.contact[0]
+    rate = -contacts.normal.rate
+    m = len(at.contact[0])
+    phase = modes[:m, 0]
+    one = jnp.ones_like(x)
     x = jnp.where(x >= 0, x, 0.0)
     stiffness = jax.jvp(lambda x: force.force(x, rate), (x,), (one,))[1]
     damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))[1]
@@ -366,13 +439,16 @@ def stable_step(
     both = jnp.where(loaded(phase)[:, None], both, 0.0)
     square, rate = jnp.max(jnp.abs(contacts.delassus[:m, :m]) @ jnp.abs(both), axis=0)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(square), rate))
-    return jnp.where(fastest > 0, STABLE / jnp.where(fastest > 0, fastest, 1.0), jnp.inf)
+    return jnp.where(
+        fastest > 0, STABLE / jnp.where(fastest > 0, fastest, 1.0), jnp.inf
+    )
 
 
 def _unloading(
     force: Force, phase: Int[Array, " m"], rate: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """`rate` in compression, `rate / e^2` in plastic expansion: of the indentation or stiffness.
+    """`rate` in compression, `rate / e^2` in plastic expansion: of the indentation or
+    stiffness.
 
     e is the coefficient of the bistiffness, by which unloading is stiffer.
     """

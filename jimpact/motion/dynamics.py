@@ -1,8 +1,8 @@
 """Gaps, their rates and accelerations, and the acceleration that forces alone give.
 
-Dimensions of arrays in this folder: nq coordinates q, n velocities v (nq = n but for bodies with
-quaternions), m contacts, t tangential directions (m in the plane, 2 m in space), k = m + t rows of
-contact space.
+Dimensions of arrays in this folder: nq coordinates q, n velocities v (nq = n but for
+bodies with quaternions), m contacts, t tangential directions (m in the plane, 2 m in
+space), k = m + t rows of contact space.
 """
 
 from collections.abc import Callable
@@ -26,28 +26,36 @@ def not_rounding(share: float, dtype: jnp.dtype) -> float:
 
 
 class Kinematics(NamedTuple):
-    """Gaps of the contacts, or displacements along their tangents, and derivatives in time.
+    """Gaps of the contacts, or displacements along their tangents, and derivatives in
+    time.
 
     Equation: `rate = gradient^T (v - B y_b')`, `d rate / dt = gradient^T v' + drift`.
     """
 
-    value: Float[Array, " d"]  # gaps [m]; 0 of tangential displacements, of which only rates count
+    # gaps [m]; 0 of tangential displacements, of which only rates count
+    value: Float[Array, " d"]
     rate: Float[Array, " d"]  # [m/s] as seen from the base
     drift: Float[Array, " d"]  # [m/s^2] derivative of the rate for v' = 0
     gradient: Float[Array, "n d"]
 
 
 def base_velocity(system: System, t: Float[Array, ""]) -> Float[Array, " n"] | None:
-    """Velocity `B y_b'(t)` of a moving base in all coordinates [m/s]; None without a base."""
+    """Velocity `B y_b'(t)` of a moving base in all coordinates [m/s]; None without a
+    base.
+    """
     if system.base is None:
         return None
     return jax.jvp(lambda s: _displaced(system, s), (t,), (jnp.ones_like(t),))[1]
 
 
-def carried_along(system: System, v: Float[Array, " n"], t: Float[Array, ""]) -> Float[Array, " n"]:
+def carried_along(
+    system: System, v: Float[Array, " n"], t: Float[Array, ""]
+) -> Float[Array, " n"]:
     """Velocity `B y_b'(t)` of the base [m/s], 0 without one."""
     velocity = base_velocity(system, t)
-    return jnp.zeros_like(v) if velocity is None else velocity
+    if velocity is None:
+        return jnp.zeros_like(v)
+    return velocity
 
 
 @full_precision
@@ -62,24 +70,34 @@ def _displaced(system: System, t: Float[Array, ""]) -> Float[Array, " n"]:
 def seen_from_base(
     system: System, q: Float[Array, " nq"], t: Float[Array, ""]
 ) -> Float[Array, " nq"]:
-    """Configuration q displaced by `-B y_b(t)`: the one that an observer on the base sees."""
-    return q if system.base is None else system.body.moved(q, -_displaced(system, t))
+    """Configuration q displaced by `-B y_b(t)`: the one that an observer on the base
+    sees.
+    """
+    if system.base is None:
+        return q
+    return system.body.moved(q, -_displaced(system, t))
 
 
-def gaps(system: System, q: Float[Array, " nq"], t: Float[Array, ""]) -> Float[Array, " m"]:
+def gaps(
+    system: System, q: Float[Array, " nq"], t: Float[Array, ""]
+) -> Float[Array, " m"]:
     """Gaps f [m] of the configuration seen from the base."""
     return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
 
 
 def is_pile(system: System) -> bool:
-    """True for a body of many contacts (`Bodies` with `room`), which stores only closed ones."""
+    """True for a body of many contacts (`Bodies` with `room`), which stores only closed
+    ones.
+    """
     return system.body.pair_count is not None
 
 
 def recorded_gaps(
     system: System, q: Float[Array, " nq"], t: Float[Array, ""]
 ) -> Float[Array, " m"]:
-    """Gaps [m] of all contacts, which the record of a motion holds; of a pile the least alone."""
+    """Gaps [m] of all contacts, which the record of a motion holds; of a pile the least
+    alone.
+    """
     if is_pile(system):
         return system.body.least_gap(seen_from_base(system, q, t))[None]
     return gaps(system, q, t)
@@ -94,12 +112,14 @@ def kinematics(
 ) -> tuple[Kinematics, Kinematics | None]:
     """Kinematics of the gaps, and with friction of the tangential displacements.
 
-    A body with formulas gives normals and tangents, whose derivative in time is the drift; of
-    other bodies gaps are differentiated twice.
+    A body with formulas gives normals and tangents, whose derivative in time is the
+    drift; of other bodies gaps are differentiated twice.
     """
     body = system.body
 
-    def tangents(at: Float[Array, " nq"]) -> tuple[Float[Array, " t"], Float[Array, "n t"]]:
+    def tangents(
+        at: Float[Array, " nq"],
+    ) -> tuple[Float[Array, " t"], Float[Array, "n t"]]:
         """Tangents H (n, t), with 0 for the displacements along them."""
         h = body.tangents(at)
         assert h is not None
@@ -109,8 +129,12 @@ def kinematics(
         normal = _differentiated(system, q, v, t)
         return normal, _along(system, q, v, t, tangents) if friction else None
 
-    def all_directions(at: Float[Array, " nq"]) -> tuple[Float[Array, " m"], Float[Array, "n d"]]:
-        """Gaps f (m,), and directions [N, H]: normals, then tangents where there is friction."""
+    def all_directions(
+        at: Float[Array, " nq"],
+    ) -> tuple[Float[Array, " m"], Float[Array, "n d"]]:
+        """Gaps f (m,), and directions [N, H]: normals, then tangents where there is
+        friction.
+        """
         known = body.directions(at, friction)
         each = [x for x in known[1:] if x is not None]
         return known.gaps, jnp.concatenate(each, axis=1)
@@ -121,13 +145,17 @@ def kinematics(
     if not friction:
         return normal, None
     slip = both.rate[m:]
-    return normal, Kinematics(jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:])
+    return normal, Kinematics(
+        jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:]
+    )
 
 
 def _differentiated(
     system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
 ) -> Kinematics:
-    """Kinematics of the gaps by differentiation along (v, 1): f, f' and `drift = f''`."""
+    """Kinematics of the gaps by differentiation along (v, 1): f, f' and
+    `drift = f''`.
+    """
     here, along = _in_time(v, t)
 
     def value_at(u: Float[Array, " n"], s: Float[Array, ""]) -> Float[Array, " m"]:
@@ -137,19 +165,25 @@ def _differentiated(
     def gaps_and_rates(
         u: Float[Array, " n"], s: Float[Array, ""]
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Gaps f [m] and their derivative f' [m/s] along (v, 1) at this displacement and time."""
+        """Gaps f [m] and their derivative f' [m/s] along (v, 1) at this displacement
+        and time.
+        """
         return jax.jvp(value_at, (u, s), along)
 
     (value, rate), (_, drift) = jax.jvp(gaps_and_rates, here, along)
-    return Kinematics(value, rate, drift, system.body.normals(seen_from_base(system, q, t)))
+    return Kinematics(
+        value, rate, drift, system.body.normals(seen_from_base(system, q, t))
+    )
 
 
 def _in_time(
     v: Float[Array, " n"], t: Float[Array, ""]
 ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """Point (u, s) = (0, 0) of displacement and time, and its rate (v, 1), for `jax.jvp`.
+    """Point (u, s) = (0, 0) of displacement and time, and its rate (v, 1), for
+    `jax.jvp`.
 
-    Only the rate depends on v, so that different velocities at one q share all other operations.
+    Only the rate depends on v, so that different velocities at one q share all other
+    operations.
     """
     return (jnp.zeros_like(v), jnp.zeros_like(t)), (v, jnp.ones_like(t))
 
@@ -159,18 +193,24 @@ def _along(
     q: Float[Array, " nq"],
     v: Float[Array, " n"],
     t: Float[Array, ""],
-    directions: Callable[[Float[Array, " nq"]], tuple[Float[Array, " m"], Float[Array, "n d"]]],
+    directions: Callable[
+        [Float[Array, " nq"]], tuple[Float[Array, " m"], Float[Array, "n d"]]
+    ],
 ) -> Kinematics:
-    """Kinematics along directions D (n, d) by one derivative: `rate = D^T (v - B y_b')`.
+    """Kinematics along directions D (n, d) by one derivative:
+    `rate = D^T (v - B y_b')`.
 
-    `directions`: configuration seen from the base -> values (m,), which are passed on, and D.
+    `directions`: configuration seen from the base -> values (m,), which are passed on,
+    and D.
     """
     here, along = _in_time(v, t)
 
     def rates(
         u: Float[Array, " n"], s: Float[Array, ""]
     ) -> tuple[Float[Array, " d"], tuple[Float[Array, " m"], Float[Array, "n d"]]]:
-        """Rates `D^T (v - B y_b')` after the displacement u and the time s; values and D there."""
+        """Rates `D^T (v - B y_b')` after the displacement u and the time s; values and
+        D there.
+        """
         value, h = directions(seen_from_base(system, system.body.nearby(q, u), t + s))
         carried = base_velocity(system, t + s)
         rate = h.T @ (v if carried is None else v - carried)
@@ -194,7 +234,9 @@ def definite(mass: Mass) -> Bool[Array, ""]:
 
 
 @full_precision
-def kinetic(system: System, q: Float[Array, " nq"], v: Float[Array, " n"]) -> Float[Array, ""]:
+def kinetic(
+    system: System, q: Float[Array, " nq"], v: Float[Array, " n"]
+) -> Float[Array, ""]:
     """`T = v^T M v / 2` [J]."""
     mass = mass_at(system, q)
     return 0.5 * v @ (mass * v if mass.ndim == 1 else mass @ v)
@@ -202,13 +244,17 @@ def kinetic(system: System, q: Float[Array, " nq"], v: Float[Array, " n"]) -> Fl
 
 def potential(system: System, q: Float[Array, " nq"]) -> Float[Array, ""]:
     """Potential energy V(q) [J], 0 without a potential."""
-    return jnp.zeros((), q.dtype) if system.potential is None else system.potential(q)
+    if system.potential is None:
+        return jnp.zeros((), q.dtype)
+    return system.potential(q)
 
 
 def user_force(
     system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
 ) -> Float[Array, " n"]:
-    """Generalized force F(q, v, t) [N, N m] of the argument `force`, without that of V."""
+    """Generalized force F(q, v, t) [N, N m] of the argument `force`, without that of
+    V.
+    """
     if system.force is None:
         return jnp.zeros_like(v)
     return jnp.asarray(system.force(q, v, t)).astype(v.dtype)
@@ -221,7 +267,8 @@ def free_acceleration(
     force: Float[Array, " n"],
     mass: Mass,
 ) -> Float[Array, " n"]:
-    """Acceleration v' [m/s^2] without contact forces: `M v' = F - grad V + (inertial forces)`.
+    """Acceleration v' [m/s^2] without contact forces:
+    `M v' = F - grad V + (inertial forces)`.
 
     `force` is F, `mass` is M at q.
     """

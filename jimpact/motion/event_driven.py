@@ -1,8 +1,9 @@
 """Motions by events: flights that land on each event, impacts in no time.
 
-One pass of the loop: where an event waits it is resolved (`transitions.resolve`) and recorded, then
-a step is tried. Lanes of a batch advance independently; an event waits until as many lanes wait as
-fly, because resolving it costs as much in one lane as in all.
+One pass of the loop: where an event waits it is resolved (`transitions.resolve`) and
+recorded, then a step is tried. Lanes of a batch advance independently; an event waits
+until as many lanes wait as fly, because resolving it costs as much in one lane as in
+all.
 """
 
 from typing import NamedTuple
@@ -51,7 +52,8 @@ class _EventRun(NamedTuple):
 
     flight: Flight
     struck: Bool[Array, " m"]  # contacts that had an impact
-    allowed: Float[Array, " rows"]  # errors of time, works and contacts, see `allowed_errors`
+    # errors of time, works and contacts, see `allowed_errors`
+    allowed: Float[Array, " rows"]
     waits: Bool[Array, ""]  # an event is to be resolved
     # [m/s] of an impact without collision that is due, 0 where another event waits
     approach: Float[Array, ""]
@@ -87,10 +89,11 @@ def empty_checkpoint(
 def event_driven(
     problem: MotionProblem, max_events: int
 ) -> tuple[Course, Float[Array, " size"] | None]:
-    """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both derivatives.
+    """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both
+    derivatives.
 
-    Where there is a `problem.past`, also the numbers of the next one, of the run that goes on after
-    the last of `max_events`; else None.
+    Where there is a `problem.past`, also the numbers of the next one, of the run that
+    goes on after the last of `max_events`; else None.
     """
     problem = problem._replace(law=forward_only(problem.law))
     return course_of(problem, problem.start, lambda problem: _run(problem, max_events))
@@ -106,15 +109,22 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
         start = _unpack_checkpoint(start, problem.past.numbers)
 
     def one(problem: MotionProblem, run: _EventRun) -> _EventRun:
-        """Run after one pass: its event if one waits and is due, then a step unless one waits."""
+        """Run after one pass: its event if one waits and is due, then a step unless one
+        waits.
+        """
         on = goes_on(problem, run)
-        waiting, flying = on & run.waits, on & ~run.waits
-        due = over_lanes(waiting.astype(jnp.int32)) >= over_lanes(flying.astype(jnp.int32))
+        waiting = on & run.waits
+        flying = on & ~run.waits
+        due = over_lanes(waiting.astype(jnp.int32)) >= over_lanes(
+            flying.astype(jnp.int32)
+        )
         run = _resolved(problem, max_events, run, waiting, due)
         return _flown(problem, run, goes_on(problem, run) & ~run.waits)
 
     # over all lanes, so that `jax.lax.cond` in a pass is not turned into a selection
-    last = until_over(lambda problem, run: any_lane(goes_on(problem, run)), one, problem, start)
+    last = until_over(
+        lambda problem, run: any_lane(goes_on(problem, run)), one, problem, start
+    )
     next_past = None
     if problem.past is not None:
         next_past = _pack_checkpoint(last, problem.past.numbers.shape[0])
@@ -126,19 +136,28 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
 
 def _checkpoint(run: _EventRun) -> _Checkpoint:
     """The fields of a run that the next one goes on from."""
-    own = {name: getattr(run, name) for name in _Checkpoint._fields if name != "samples"}
+    own = {
+        name: getattr(run, name) for name in _Checkpoint._fields if name != "samples"
+    }
     return _Checkpoint(**own, samples=run.table.samples)
 
 
 def _pack_checkpoint(run: _EventRun, size: int) -> Float[Array, " size"]:
-    """Numbers of `Past`: 1, the leaves of the checkpoint in turn, zeros up to `size`."""
-    parts = [jnp.ravel(x).astype(run.allowed.dtype) for x in jax.tree.leaves(_checkpoint(run))]
+    """Numbers of `Past`: 1, the leaves of the checkpoint in turn, zeros up to
+    `size`.
+    """
+    parts = [
+        jnp.ravel(x).astype(run.allowed.dtype)
+        for x in jax.tree.leaves(_checkpoint(run))
+    ]
     flat = jnp.concatenate([jnp.ones(1, run.allowed.dtype), *parts])
     return jnp.pad(flat, (0, size - flat.shape[0]))
 
 
 def _unpack_checkpoint(start: _EventRun, past: Float[Array, " size"]) -> _EventRun:
-    """Run that goes on from the numbers of `Past`, or `start` where their first one is 0."""
+    """Run that goes on from the numbers of `Past`, or `start` where their first one is
+    0.
+    """
     leaves, tree = jax.tree.flatten(_checkpoint(start))
     ends = np.cumsum([1] + [x.size for x in leaves])
     parts = jnp.split(past, ends)[1:-1]
@@ -151,13 +170,20 @@ def _unpack_checkpoint(start: _EventRun, past: Float[Array, " size"]) -> _EventR
 
 
 def _begin(problem: MotionProblem, max_events: int) -> _EventRun:
-    """Run at the start of the motion: contacts open; an event waits, which finds their modes."""
+    """Run at the start of the motion: contacts open; an event waits, which finds their
+    modes.
+    """
     system, _, mu, settings, q0, v0, times, *_ = problem
-    m, dtype = problem.contacts, q0.dtype
+    m = problem.contacts
+    dtype = q0.dtype
     state = problem.start
-    margins = 2 * m if settings.friction else m
+    if settings.friction:
+        margins = 2 * m
+    else:
+        margins = m
     flight = first_flight(system, state, encoded(no_modes(m, dtype)), margins, times)
-    zero, no = jnp.zeros((), dtype), jnp.asarray(False)
+    zero = jnp.zeros((), dtype)
+    no = jnp.asarray(False)
     status = status_at_start(system, state, times[-1], settings.closed_below)
     if mu is not None:
         known = jnp.all(jnp.isfinite(mu))
@@ -184,21 +210,39 @@ def _resolved(
     waiting: Bool[Array, ""],
     due: Bool[Array, ""],
 ) -> _EventRun:
-    """Run after its event, resolved and recorded if it is `waiting` here and `due` in all lanes.
+    """Run after its event, resolved and recorded if it is `waiting` here and `due` in
+    all lanes.
 
     An event more than `max_events` is not resolved: the status says so.
     """
     system, law, mu, settings, *_ = problem
-    flight, old = run.flight, run.flight.state
+    flight = run.flight
+    old = run.flight.state
 
-    def now(run: _EventRun) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
+    def now(
+        run: _EventRun,
+    ) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
         """Run after the event, and the rows of the event in the table."""
-        modes, fired = decoded(flight.aim.modes, old.q.dtype), flight.event & waiting
+        modes = decoded(flight.aim.modes, old.q.dtype)
+        fired = flight.event & waiting
         outcome = resolve(
-            system, law, mu, settings, old, modes, fired, run.scales, run.struck, run.approach
+            system,
+            law,
+            mu,
+            settings,
+            old,
+            modes,
+            fired,
+            run.scales,
+            run.struck,
+            run.approach,
         )
         happened = outcome.kind != KIND_CODE["none"]
-        most = max_events if problem.past is None else jnp.minimum(problem.past.most, max_events)
+        most = (
+            max_events
+            if problem.past is None
+            else jnp.minimum(problem.past.most, max_events)
+        )
         full = (run.event_count >= most) & happened  # no row is left
         status = jnp.where(full, CODE["max_events"], outcome.status).astype(jnp.int32)
         written = waiting & happened & ~full
@@ -220,15 +264,23 @@ def _resolved(
             status=status,
         )
         codes = jnp.stack([outcome.kind, outcome.code])
-        marks = jnp.concatenate([codes.astype(jnp.int32), outcome.contacts.astype(jnp.int32)])
+        marks = jnp.concatenate(
+            [codes.astype(jnp.int32), outcome.contacts.astype(jnp.int32)]
+        )
         numbers = event_numbers(old, outcome.after)
         # an event without a row is not resolved
         new = selected(full, run._replace(status=status), new)
         return selected(waiting, new, run), numbers, marks
 
-    def later(run: _EventRun) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
+    def later(
+        run: _EventRun,
+    ) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
         """The run as it is, and rows of zeros."""
-        return run, jnp.zeros_like(run.table.events[0]), jnp.zeros_like(run.table.marks[0])
+        return (
+            run,
+            jnp.zeros_like(run.table.events[0]),
+            jnp.zeros_like(run.table.marks[0]),
+        )
 
     table = run.table
     # both branches return what they are given: the first row of each table is enough
@@ -239,13 +291,16 @@ def _resolved(
 
 
 def _flown(problem: MotionProblem, run: _EventRun, flies: Bool[Array, ""]) -> _EventRun:
-    """Run after one pass of the stepper, where it `flies`; its state is recorded as next sample.
+    """Run after one pass of the stepper, where it `flies`; its state is recorded as
+    next sample.
 
     That row is overwritten until the sample is reached.
     """
     system, _, mu, settings, *_ = problem
     times = problem.times
-    begin, last = run.flight, times.shape[0]  # the last row of samples is discarded
+    # the last row of samples is discarded
+    begin = run.flight
+    last = times.shape[0]
     modes = decoded(begin.aim.modes, begin.state.q.dtype)
     flow = flow_of(system, mu, settings, modes, run.scales, times, begin.state)
     flight, _ = one_pass(flow, settings, run.allowed, times, begin, flies)

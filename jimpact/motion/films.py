@@ -30,15 +30,20 @@ from jimpact.tools.checks import check_values
 from jimpact.tools.progress import counting_bar
 
 ENDINGS = (".gif", ".mp4", ".html")
-_SHORTEST = 2.0  # [s] films of shorter motions are slow; ten times more slows most motions down
-# [1/s] of a film. Ten times more: files ten times as large, which most screens cannot show.
+# [s] films of shorter motions are slow; ten times more slows most motions down
+_SHORTEST = 2.0
+# [1/s] of a film. Ten times more: files ten times as large, which most screens cannot
+# show.
 _FRAMES_PER_SECOND = 25.0
-_GIF_CLOCK, _GIF_LEAST = 100.0, 2.0  # a GIF counts in 1/100 s; viewers do not show less than two
-# [s] Frames last a little longer, because whole milliseconds are cut off the rounded numbers of a
-# GIF; a thousand times more would slow films down.
+# a GIF counts in 1/100 s; viewers do not show less than two
+_GIF_CLOCK = 100.0
+_GIF_LEAST = 2.0
+# [s] Frames last a little longer, because whole milliseconds are cut off the rounded
+# numbers of a GIF; a thousand times more would slow films down.
 _CUT_OFF = 1e-6
 _PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
-# [MB] Largest page with its frames. matplotlib's own limit, 20, leaves out the end of a long film.
+# [MB] Largest page with its frames. matplotlib's own limit, 20, leaves out the end of a
+# long film.
 _LARGEST_PAGE = 1000
 
 
@@ -54,11 +59,11 @@ def animation(
 ) -> Path:
     """The motion as a film: an animated GIF, an MP4, or a page (.html) that plays it.
 
-    Frames are equally spaced in time, whatever the samples are: between the states of the record,
-    those at events included, positions follow cubics with the velocities of the record. Bodies in
-    space are shown in parallel projection, with their shadows. What moves with the base moves in
-    the picture. The page holds all frames and has a slider; only the icons of its buttons come
-    from the network.
+    Frames are equally spaced in time, whatever the samples are: between the states of
+    the record, those at events included, positions follow cubics with the velocities of
+    the record. Bodies in space are shown in parallel projection, with their shadows.
+    What moves with the base moves in the picture. The page holds all frames and has a
+    slider; only the icons of its buttons come from the network.
 
     Args:
         system: that moved.
@@ -66,37 +71,46 @@ def animation(
         path: the file, ending in .gif, .mp4 (needs ffmpeg) or .html.
         title: of the picture; the time stands below it.
         progress: a bar on stderr; None: on a terminal, where it takes long.
-        speed: of the film, not in [m/s]: seconds of the motion that a second of it shows; 1: real
-            time, 0.1: slow motion. None: 1, and less for motions of less than two seconds.
+        speed: of the film, not in [m/s]: seconds of the motion that a second of it
+            shows; 1: real time, 0.1: slow motion. None: 1, and less for motions of less
+            than two seconds.
         frames_per_second: of the film; a GIF has the nearest rate of 100 / k.
 
     Returns:
         The path of the file that was written.
 
     Raises:
-        ValueError: another ending, a batch, no sample, a speed or rate that is not positive;
+        ValueError: another ending, a batch, no sample, a speed or rate that is not
+            positive;
         TypeError: a body without outlines; RuntimeError: an MP4 without ffmpeg.
 
     >>> import tempfile, pathlib, jimpact as ji
     >>> ball = ji.System(ji.Column([1.0]), gravity=True)
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
     >>> place = pathlib.Path(tempfile.mkdtemp())
-    >>> ji.plot.animation(ball, motion, place / "ball.gif", speed=0.5, frames_per_second=10).name
+    >>> ji.plot.animation(
+    ...     ball, motion, place / "ball.gif", speed=0.5, frames_per_second=10
+    ... ).name
     'ball.gif'
     """
     one_motion(motion)
     path = Path(path)
     if path.suffix not in ENDINGS:
-        raise ValueError(f"Argument `path` must end in {' or '.join(ENDINGS)}, but is '{path}'.")
+        raise ValueError(
+            f"Argument `path` must end in {' or '.join(ENDINGS)}, but is '{path}'."
+        )
     check_values("speed", speed, low=0.0, open_low=True)
     check_values("frames_per_second", frames_per_second, low=0.0, open_low=True)
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise RuntimeError(
-            "Argument `path` ends in .mp4, for which the program ffmpeg must be installed: install "
+            "Argument `path` ends in .mp4, for which the program ffmpeg must be "
+            "installed: install "
             "it, or give a path that ends in .gif or .html."
         )
     if path.suffix == ".gif":
-        frames_per_second = _GIF_CLOCK / max(round(_GIF_CLOCK / frames_per_second), _GIF_LEAST)
+        frames_per_second = _GIF_CLOCK / max(
+            round(_GIF_CLOCK / frames_per_second), _GIF_LEAST
+        )
     count, frames = _frames(system, motion, title, speed, frames_per_second)
     path.parent.mkdir(parents=True, exist_ok=True)
     with counting_bar(count, "frames", progress) as advance:
@@ -113,7 +127,8 @@ def animation(
 
 
 def readable_speed(duration: float) -> float:
-    """Speed of a film: 1, or the largest of .5, .2, .1, .. at which it lasts 2 s (`_SHORTEST`).
+    """Speed of a film: 1, or the largest of .5, .2, .1, .. at which it lasts 2 s
+    (`_SHORTEST`).
 
     `duration` [s] is that of the motion, `duration / speed` that of the film.
 
@@ -125,34 +140,56 @@ def readable_speed(duration: float) -> float:
     if not 0 < wanted < 1:
         return 1.0
     power = float(10.0 ** np.floor(np.log10(wanted) + 1e-9))
-    return float(max(x for x in (1.0, 2.0, 5.0) if x * power <= wanted * (1 + 1e-9))) * power
+    return (
+        float(max(x for x in (1.0, 2.0, 5.0) if x * power <= wanted * (1 + 1e-9)))
+        * power
+    )
 
 
 def _frames(
     system: System, motion: Motion, title: str, speed: float | None, rate: float
 ) -> tuple[int, FuncAnimation]:
-    """Number of frames, and the film of a motion at `speed`, with `rate` frames a second."""
-    course, body = course_of(motion), system.body
+    """Number of frames, and the film of a motion at `speed`, with `rate` frames a
+    second.
+    """
+    course = course_of(motion)
+    body = system.body
     known = np.isfinite(course.q).all(axis=1) & np.isfinite(course.v).all(axis=1)
-    at, q, v = course.time[known], course.q[known], course.v[known]
+    at = course.time[known]
+    q = course.q[known]
+    v = course.v[known]
     if not len(at):
-        raise ValueError("Argument `motion` must have a sample that was reached, but has none.")
-    speed = readable_speed(at[-1] - at[0]) if speed is None else float(speed)
+        raise ValueError(
+            "Argument `motion` must have a sample that was reached, but has none."
+        )
+    if speed is None:
+        speed = readable_speed(at[-1] - at[0])
+    else:
+        speed = float(speed)
     count = int((at[-1] - at[0]) / speed * rate + 1e-9) + 1
     time = at[0] + np.arange(count) * speed / rate
     slopes = np.asarray(jax.vmap(body.rates)(jnp.asarray(q), jnp.asarray(v)))  # dq/dt
-    q, ground = positions(at, q, slopes, time), np.zeros((count, 2))
+    q = positions(at, q, slopes, time)
+    ground = np.zeros((count, 2))
     point = POINT * (np.ptp(q) or 1.0)
     if system.base is not None:
-        q = np.asarray(jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time)))
+        q = np.asarray(
+            jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time))
+        )
         ground = base_path(system, time)  # in the picture
         if ground.shape[1] == 3:
             ground = projected(ground)
         elif ground.shape[1] == 1:
             ground = np.insert(ground, 0, 0.0, axis=1)
-    curves = [[curve + moved for curve in body.outlines(x, point)] for x, moved in zip(q, ground)]
+    curves = [
+        [curve + moved for curve in body.outlines(x, point)]
+        for x, moved in zip(q, ground)
+    ]
     digits = max(2, int(np.ceil(-np.log10(speed / rate))))  # in which frames differ
-    slow = "" if speed == 1 else f" (speed {speed:g})"
+    if speed == 1:
+        slow = ""
+    else:
+        slow = f" (speed {speed:g})"
     captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
     return count, _film(body, curves, colours_of(body, q[0], point), ground, captions)
 
@@ -164,10 +201,11 @@ def _film(
     ground: np.ndarray,
     captions: list[str],
 ) -> FuncAnimation:
-    """Film of curves in their `colours`, the planes that a body stands on, and captions.
+    """Film of curves in their `colours`, the planes that a body stands on, and
+    captions.
 
-    For each frame: outlines `curves[k]` (points, 2) of the body [m], displacement `ground[k]` (2,)
-    of the planes, caption.
+    For each frame: outlines `curves[k]` (points, 2) of the body [m], displacement
+    `ground[k]` (2,) of the planes, caption.
     """
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
@@ -189,27 +227,38 @@ def _film(
     return FuncAnimation(figure, draw, frames=len(captions))
 
 
-def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Ends (2, 2), a column each, of the part of a plane `n^T (x - ground) = offset` in view.
+def stretch_of(
+    n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray
+) -> np.ndarray:
+    """Ends (2, 2), a column each, of the part of a plane `n^T (x - ground) = offset` in
+    view.
 
-    `view` (2, 2) are the limits of x and of y, `ground` (2,) is the displacement of the plane. The
-    middle is the foot of the perpendicular from the centre of the view.
+    `view` (2, 2) are the limits of x and of y, `ground` (2,) is the displacement of the
+    plane. The middle is the foot of the perpendicular from the centre of the view.
     """
-    middle, reach = view.mean(axis=1), np.ptp(view[0])
+    middle = view.mean(axis=1)
+    reach = np.ptp(view[0])
     foot = middle - (n @ (middle - ground) - offset) * n
     return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
 
 
-def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """q (K, n) at `time` (K,), by cubics between states q (S, n), dq/dt (S, n) at `at` (S,).
+def positions(
+    at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    """q (K, n) at `time` (K,), by cubics between states q (S, n), dq/dt (S, n) at `at`
+    (S,).
 
     Equation: Hermite's `q = (1 + 2 s)(1 - s)^2 q_k + s^2 (3 - 2 s) q_(k+1)
-    + s (1 - s)^2 h q'_k - s^2 (1 - s) h q'_(k+1)`, `s = (t - t_k) / h`. Times may repeat: states
-    before and after an event.
+    + s (1 - s)^2 h q'_k - s^2 (1 - s) h q'_(k+1)`, `s = (t - t_k) / h`. Times may
+    repeat: states before and after an event.
 
     >>> import numpy as np
     >>> from jimpact.motion.films import positions
-    >>> at, q, slopes = np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.array([[0.0], [2.0]])
+    >>> at, q, slopes = (
+    ...     np.array([0.0, 1.0]),
+    ...     np.array([[0.0], [1.0]]),
+    ...     np.array([[0.0], [2.0]]),
+    ... )
     >>> positions(at, q, slopes, np.array([0.5]))  # t^2
     array([[0.25]])
     """
@@ -218,6 +267,7 @@ def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarra
     k = np.clip(np.searchsorted(at, time, side="right") - 1, 0, len(at) - 2)
     h = (at[k + 1] - at[k])[:, None]
     s = (time - at[k])[:, None] / np.where(h > 0, h, 1.0)
-    begin, end = (1 + 2 * s) * (1 - s) ** 2, s**2 * (3 - 2 * s)
+    begin = (1 + 2 * s) * (1 - s) ** 2
+    end = s**2 * (3 - 2 * s)
     turns = s * (1 - s) ** 2 * h * slopes[k] - s**2 * (1 - s) * h * slopes[k + 1]
     return begin * q[k] + end * q[k + 1] + turns

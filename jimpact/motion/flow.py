@@ -1,9 +1,11 @@
-"""Flights and persistent contact: flows of the event-aligned stepper, `numerics/stepper.py`.
+"""Flights and persistent contact: flows of the event-aligned stepper,
+`numerics/stepper.py`.
 
-A *flight* is the motion between two events. A *sample* is an instant at which the state is
-recorded; steps land on it. *Modes* are frozen in a step: see `persistent_contact.Modes`. *Margins*
-are quantities that stay positive while the modes hold; one that falls to 0 is an event. Rows of the
-stepper have a last axis for a batch, here of length 1.
+A *flight* is the motion between two events. A *sample* is an instant at which the state
+is recorded; steps land on it. *Modes* are frozen in a step: see
+`persistent_contact.Modes`. *Margins* are quantities that stay positive while the modes
+hold; one that falls to 0 is an event. Rows of the stepper have a last axis for a batch,
+here of length 1.
 """
 
 import abc
@@ -58,23 +60,28 @@ from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
-# Error allowed in the ledger, as a share of the work of the errors allowed in q and v: ten times
-# more, and
+# Error allowed in the ledger, as a share of the work of the errors allowed in q and v:
+# ten times more, and
 # the steps of a body that rests on a moving base are those of the base's motion only.
 LEDGER = 0.01
-# Share of the speed scale: a persistent contact that has more gap velocity after a step has got
-# another normal, as a corner that slides over an edge has. Steps themselves leave some roundings,
-# and at most MORE_THAN_STEPS times their relative tolerance. Ten times more: a hundred times the
-# energy, 1e-12 of it here, is lost unseen where normals turn by less.
-JUMP, MORE_THAN_STEPS = 1e-6, 1e3
+# Share of the speed scale: a persistent contact that has more gap velocity after a step
+# has got another normal, as a corner that slides over an edge has. Steps themselves
+# leave some roundings, and at most MORE_THAN_STEPS times their relative tolerance. Ten
+# times more: a hundred times the energy, 1e-12 of it here, is lost unseen where normals
+# turn by less.
+JUMP = 1e-6
+MORE_THAN_STEPS = 1e3
 FORGET = 0.5  # of the last free step, that shorter ones leave of it each
-# Steps at least that the duration is cut into where loads or a base may depend on time, each seen
-# at 12 instants: a pulse shorter than about a 200th of the duration may be missed.
+# Steps at least that the duration is cut into where loads or a base may depend on time,
+# each seen at 12 instants: a pulse shorter than about a 200th of the duration may be
+# missed.
 LOOKS = 64
 
 
 class State(NamedTuple):
-    """State of a motion: q, v, t, and the work of forces, base and contacts since the start [J]."""
+    """State of a motion: q, v, t, and the work of forces, base and contacts since the
+    start [J].
+    """
 
     q: Float[Array, " nq"]
     v: Float[Array, " n"]
@@ -82,8 +89,8 @@ class State(NamedTuple):
     work: Float[Array, ""]
     base_work: Float[Array, ""]
     contact_work: Float[Array, "2 m"]  # normal, tangential
-    # of compliant contacts: indentation [m], then impulses [N s], normal and tangential (none
-    # without friction); of rigid ones no rows
+    # of compliant contacts: indentation [m], then impulses [N s], normal and tangential
+    # (none without friction); of rigid ones no rows
     contact: Float[Array, "c m"]
 
 
@@ -102,7 +109,8 @@ class Settings(NamedTuple):
 
 
 def speed_of(energy: Float[Array, ""], w: Float[Array, " k"]) -> Float[Array, ""]:
-    """Largest gap velocity `max_j sqrt(2 T W_jj)` [m/s] that a kinetic energy T could give.
+    """Largest gap velocity `max_j sqrt(2 T W_jj)` [m/s] that a kinetic energy T could
+    give.
 
     `w` is the diagonal W_jj of the Delassus matrix.
     """
@@ -113,8 +121,8 @@ class Scales(NamedTuple):
     """Largest values of the motion so far."""
 
     gap_velocity: Float[Array, ""]  # [m/s]
-    # [m/s] gap velocity that all kinetic energy could give a contact; at least what bodies at rest
-    # gain while a closed gap opens
+    # [m/s] gap velocity that all kinetic energy could give a contact; at least what
+    # bodies at rest gain while a closed gap opens
     speed: Float[Array, ""]
     acceleration: Float[Array, ""]  # [m/s^2] of a gap
 
@@ -129,10 +137,11 @@ def contact_margins(
 ) -> Float[Array, " k"]:
     """Margins while the modes hold: gaps or normal forces, then those of friction.
 
-    Equation: `f_j - below_j` of an open contact, `lambda_j W_jj + slack` of a persistent one, with
-    a slack for rounding; friction by `friction_margins`.
+    Equation: `f_j - below_j` of an open contact, `lambda_j W_jj + slack` of a
+    persistent one, with a slack for rounding; friction by `friction_margins`.
 
-    `below`: gaps <= 0 that the step begins with [m]. `slip`: directions, as in `forces`.
+    `below`: gaps <= 0 that the step begins with [m]. `slip`: directions, as in
+    `forces`.
     """
     m = modes.active.shape[0]
     force = forces(contacts, mu, modes, slip)
@@ -142,10 +151,13 @@ def contact_margins(
     normal = jnp.where(modes.active, force.normal * w[:m] + slack, gap)
     if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
-    # sliding ends where slip does, and where its forces stop to exist: both may be in one step
-    slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
+    # sliding ends where slip does, and where its forces stop to exist: both may be in
+    # one step else its product with slip is 0
+    slides = any_lane(jnp.any(modes.active & ~modes.stick))
     one = jnp.ones((), w.dtype)
-    regular = jax.lax.cond(slides, lambda: regularity(contacts, mu, modes, slip), lambda: one)
+    regular = jax.lax.cond(
+        slides, lambda: regularity(contacts, mu, modes, slip), lambda: one
+    )
     lasts = regular - precision(w.dtype).root
     friction = friction_margins(contacts, mu, modes, force, lasts, slack, scales.speed)
     return jnp.concatenate([normal, friction])
@@ -160,11 +172,12 @@ def friction_margins(
     slack: Float[Array, ""],
     speed_scale: Float[Array, ""],
 ) -> Float[Array, " m"]:
-    """Margins of friction: distance from the rim of the cone plus `slack`, or slip times `lasts`.
+    """Margins of friction: distance from the rim of the cone plus `slack`, or slip
+    times `lasts`.
 
-    The first of contacts that stick, see `cone_margins`; the second of those that slide, see
-    `slip_margins`, with `lasts` what is left of the regularity until forces count as singular; 1 of
-    open ones.
+    The first of contacts that stick, see `cone_margins`; the second of those that
+    slide, see `slip_margins`, with `lasts` what is left of the regularity until forces
+    count as singular; 1 of open ones.
     """
     cone = cone_margins(contacts, mu, force) + slack
     ends = slip_margins(contacts, mu, modes, force, lasts, speed_scale)
@@ -174,9 +187,9 @@ def friction_margins(
 class MotionFlow(eqx.Module, stepper.Flow):
     """Flow of the stepper that rigid and compliant contacts have in common.
 
-    Rows y of the state: those of `State`, then `error_only_rows`. The last of the margins is the
-    time left to the next sample. Margins are in units of their rounding. In space tangents are
-    along the `axes` of the step.
+    Rows y of the state: those of `State`, then `error_only_rows`. The last of the
+    margins is the time left to the next sample. Margins are in units of their rounding.
+    In space tangents are along the `axes` of the step.
     """
 
     system: System
@@ -191,15 +204,20 @@ class MotionFlow(eqx.Module, stepper.Flow):
 
     @property
     def error_only_rows(self) -> int:
-        """Number of rows after those of the state, whose errors only limit the length of steps.
+        """Number of rows after those of the state, whose errors only limit the length
+        of steps.
 
         In space m: logarithms of slip, so that steps follow it until little is left.
         """
-        return 0 if self.axes is None else len(self.axes.speed)
+        if self.axes is None:
+            return 0
+        return len(self.axes.speed)
 
     @property
     def taking_part(self) -> int:  # type: ignore[override]
-        """1: it scales the number of passes that the stepper allows at full tolerance."""
+        """1: it scales the number of passes that the stepper allows at full
+        tolerance.
+        """
         return 1
 
     @property
@@ -218,12 +236,20 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """1: margins are in units of their rounding."""
         return jnp.ones((1, 1), self.sizes.dtype)
 
-    def from_margins(self, margins: Float[Array, " k"], at: State) -> Float[Array, "margins 1"]:
-        """Rows of margins, that of the next sample `t_sample - t` last, over their rounding."""
+    def from_margins(
+        self, margins: Float[Array, " k"], at: State
+    ) -> Float[Array, "margins 1"]:
+        """Rows of margins, that of the next sample `t_sample - t` last, over their
+        rounding.
+        """
         return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
 
     def errors_of_error_only_rows(
-        self, settings: Settings, state: State, h: Float[Array, ""], of_q: Float[Array, " nq"]
+        self,
+        settings: Settings,
+        state: State,
+        h: Float[Array, ""],
+        of_q: Float[Array, " nq"],
     ) -> list[Float[Array, " m"]]:
         """Errors that a step of length h [s] may make in `error_only_rows`.
 
@@ -240,7 +266,10 @@ class MotionFlow(eqx.Module, stepper.Flow):
 
     def contacts(self, at: State) -> Contacts:
         """Contact space at this state, with tangents along the axes of the step."""
-        along = None if self.axes is None else self.axes.along
+        if self.axes is None:
+            along = None
+        else:
+            along = self.axes.along
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None, along)
 
     def slip(self, modes: Modes, contacts: Contacts) -> Float[Array, "m 2"] | None:
@@ -252,14 +281,18 @@ class MotionFlow(eqx.Module, stepper.Flow):
     def rows_of(
         self, rates: State, at: State, modes: Modes, contacts: Contacts, force: Forces
     ) -> list[Float[Array, "rows 1"]]:
-        """Rates (rows, 1) of the state, and in space those of the logarithms of slip."""
+        """Rates (rows, 1) of the state, and in space those of the logarithms of
+        slip.
+        """
         rows = [self.regular(rates, at)]
         if self.axes is not None:
             rows.append(log_rates(self.axes, modes, contacts, force)[:, None])
         return rows
 
     def projected(self, const: Any, at: State) -> tuple[State, Bool[Array, " jumps"]]:
-        """The state, moved back onto the constraints of its modes; true where a normal jumped."""
+        """The state, moved back onto the constraints of its modes; true where a normal
+        jumped.
+        """
         return at, jnp.zeros(0, bool)
 
     def switch(
@@ -272,7 +305,10 @@ class MotionFlow(eqx.Module, stepper.Flow):
         return modes, y
 
     def over(
-        self, modes: Int[Array, "k 1"], y: Float[Array, "rows 1"], passes: Float[Array, "1 1"]
+        self,
+        modes: Int[Array, "k 1"],
+        y: Float[Array, "rows 1"],
+        passes: Float[Array, "1 1"],
     ) -> Bool[Array, "1 1"]:
         """False: the loop of the motion decides when it ends."""
         return jnp.zeros((1, 1), bool)
@@ -280,26 +316,33 @@ class MotionFlow(eqx.Module, stepper.Flow):
     def regular(self, rates: State, at: State) -> Float[Array, "rows 1"]:
         """Rates (rows, 1) of the state; NaN where M is not positive definite."""
         if callable(self.system.mass):
-            return jnp.where(definite(mass_at(self.system, at.q)), packed(rates), jnp.nan)
+            return jnp.where(
+                definite(mass_at(self.system, at.q)), packed(rates), jnp.nan
+            )
         return packed(rates)
 
 
 class MechanicalFlow(MotionFlow):
     """Rigid contacts with frozen modes: open, or persistent and sticking or sliding.
 
-    Modes (rows): for each contact, whether it is persistent, whether it sticks, the sign of its
-    sliding. Margins: gaps of open contacts, normal forces of persistent ones, then friction (the
-    cone, or the speed of sliding times what is left of `regularity`).
+    Modes (rows): for each contact, whether it is persistent, whether it sticks, the
+    sign of its sliding. Margins: gaps of open contacts, normal forces of persistent
+    ones, then friction (the cone, or the speed of sliding times what is left of
+    `regularity`).
     """
 
     scales: Scales
-    below: Float[Array, " m"]  # [m] gaps that the step begins with, 0 where they are positive
+    # [m] gaps that the step begins with, 0 where they are positive
+    below: Float[Array, " m"]
 
-    near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
+    # steps in time are exact for parabolas: only the last of a landing is not in time
+    near = 0.01
 
     @property
     def error_only_rows(self) -> int:
-        """Gaps by integration (m), too: steps follow a base that moves faster than the body."""
+        """Gaps by integration (m), too: steps follow a base that moves faster than the
+        body.
+        """
         return self.like.contact_work.shape[1] + super().error_only_rows
 
     @property
@@ -308,16 +351,26 @@ class MechanicalFlow(MotionFlow):
         return self.scales.speed
 
     def errors_of_error_only_rows(
-        self, settings: Settings, state: State, h: Float[Array, ""], of_q: Float[Array, " nq"]
+        self,
+        settings: Settings,
+        state: State,
+        h: Float[Array, ""],
+        of_q: Float[Array, " nq"],
     ) -> list[Float[Array, " m"]]:
         """Errors `atol + rtol (|f| + h |f'| + |N|^T |u|)` of gaps, then those of slip.
 
-        u: sizes of coordinates in the step, of displacements where the body has quaternions.
+        u: sizes of coordinates in the step, of displacements where the body has
+        quaternions.
         """
-        of_u = of_q if self.system.body.coordinates is None else h * jnp.abs(state.v)
+        if self.system.body.coordinates is None:
+            of_u = of_q
+        else:
+            of_u = h * jnp.abs(state.v)
         normal, _ = kinematics(self.system, state.q, state.v, state.t)
         of_gap = (
-            jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
+            jnp.abs(normal.value)
+            + h * jnp.abs(normal.rate)
+            + jnp.abs(normal.gradient).T @ of_u
         )
         errors = settings.atol + settings.rtol * of_gap
         return [errors, *super().errors_of_error_only_rows(settings, state, h, of_q)]
@@ -331,8 +384,9 @@ class MechanicalFlow(MotionFlow):
     ) -> Float[Array, "rows 1"]:
         """Rates of q, v, t and the works with the forces that keep the modes.
 
-        Equation: `q' = rates(q, v)`, `M v' = (loads) + N lambda_n + H lambda_t`, powers `F . v`,
-        `lambda_t . u` and that of the base; then gap velocities of open contacts, in space
+        Equation: `q' = rates(q, v)`, `M v' = (loads) + N lambda_n + H lambda_t`, powers
+        `F . v`, `lambda_t . u` and that of the base; then gap velocities of open
+        contacts, in space
         `(ln |u|)'`.
         """
         at = unpacked(self.like, y)
@@ -360,21 +414,27 @@ class MechanicalFlow(MotionFlow):
         at = unpacked(self.like, y)
         contacts = self.contacts(at)
         slip = self.slip(const, contacts)
-        margins = contact_margins(contacts, self.mu, const, self.scales, self.below, slip)
+        margins = contact_margins(
+            contacts, self.mu, const, self.scales, self.below, slip
+        )
         return self.from_margins(margins, at)
 
     def projected(self, const: Modes, at: State) -> tuple[State, Bool[Array, " m"]]:
-        """Gaps, gap velocities and slip that the modes hold set to 0: the least change by M.
+        """Gaps, gap velocities and slip that the modes hold set to 0: the least change
+        by M.
 
-        Equation: `q += M^-1 D p_q`, `v += M^-1 D p_v` with `W p = -(f, rates)` in held rows. A
-        persistent contact whose gap velocity exceeds JUMP of the speed after the step has got
-        another normal: then nothing is changed. True (second result) where that is so.
+        Equation: `q += M^-1 D p_q`, `v += M^-1 D p_v` with `W p = -(f, rates)` in held
+        rows. A persistent contact whose gap velocity exceeds JUMP of the speed after
+        the step has got another normal: then nothing is changed. True (second result)
+        where that is so.
         """
         contacts = self.contacts(at)
-        value, rate = contacts.normal.value, contacts.normal.rate
+        value = contacts.normal.value
+        rate = contacts.normal.rate
         most = max(not_rounding(JUMP, rate.dtype), MORE_THAN_STEPS * self.rtol)
         # a motion that began at rest had no speed before this step
-        energy, w = kinetic(self.system, at.q, at.v), jnp.diagonal(contacts.delassus)
+        energy = kinetic(self.system, at.q, at.v)
+        w = jnp.diagonal(contacts.delassus)
         speed = jnp.maximum(self.scales.speed, speed_of(energy, w[: len(rate)]))
         jumps = const.active & (jnp.abs(rate) > most * speed)
         if contacts.tangent is not None:  # tangentially only velocities drift
@@ -382,9 +442,13 @@ class MechanicalFlow(MotionFlow):
             rate = jnp.concatenate([rate, contacts.tangent.rate])
             if self.axes is not None:
                 const = straightened(self.axes, const, contacts.tangent.rate)
-        p = constraint_impulse(contacts, self.mu, const, jnp.stack([value, rate], axis=1))
+        p = constraint_impulse(
+            contacts, self.mu, const, jnp.stack([value, rate], axis=1)
+        )
         move = contacts.moved @ p
-        back = at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
+        back = at._replace(
+            q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1]
+        )
         return selected(jnp.any(jumps), at, back), jumps
 
 
@@ -416,17 +480,20 @@ class Flight(NamedTuple):
 
     state: State
     aim: stepper.Step  # the step to try
-    plan: Float[Array, "4 1"]  # `StepperState.progress`: what the stepper expects of the step
+    # `StepperState.progress`: what the stepper expects of the step
+    plan: Float[Array, "4 1"]
     free: Float[Array, ""]  # [s] length of steps that neither event nor sample shortens
     event: Bool[Array, " margins"]  # margins that the last step has brought to 0
     jumped: Bool[Array, ""]  # a normal has jumped: no derivatives from then on
     sample: Int[Array, ""]  # number of samples reached
     steps: Int[Array, ""]
-    stuck: Bool[Array, ""]  # steps vanish, are too many, or left the range of the gap function
+    # steps vanish, are too many, or left the range of the gap function
+    stuck: Bool[Array, ""]
 
 
 def longest_step(system: System, targets: Float[Array, " S"]) -> Float[Array, ""]:
-    """Bound of a step [s]: a part of the duration where loads or base may depend on time, or inf.
+    """Bound of a step [s]: a part of the duration where loads or base may depend on
+    time, or inf.
 
     `targets`: times of the samples.
     """
@@ -436,7 +503,11 @@ def longest_step(system: System, targets: Float[Array, " S"]) -> Float[Array, ""
 
 
 def first_flight(
-    system: System, state: State, rows: Int[Array, "k 1"], events: int, targets: Float[Array, " S"]
+    system: System,
+    state: State,
+    rows: Int[Array, "k 1"],
+    events: int,
+    targets: Float[Array, " S"],
 ) -> Flight:
     """A flight at the start of the motion, where the first sample is reached.
 
@@ -460,16 +531,21 @@ def first_flight(
     )
 
 
-def next_sample(targets: Float[Array, " S"], reached: Int[Array, ""]) -> Float[Array, ""]:
+def next_sample(
+    targets: Float[Array, " S"], reached: Int[Array, ""]
+) -> Float[Array, ""]:
     """Time [s] of the sample that follows the first `reached` ones."""
     return targets[jnp.minimum(reached, targets.shape[0] - 1)]
 
 
-def toward_sample(flight: Flight, targets: Float[Array, " S"], h: Float[Array, ""]) -> Flight:
+def toward_sample(
+    flight: Flight, targets: Float[Array, " S"], h: Float[Array, ""]
+) -> Flight:
     """The flight with a next step of length h [s], which lands on a nearer sample."""
     left = next_sample(targets, flight.sample) - flight.state.t
     lands = left <= h
-    # the last margin is the time left; `clock` and `plan`: see `stepper.Step`, `StepperState`
+    # the last margin is the time left; `clock` and `plan`: see `stepper.Step`,
+    # `StepperState`
     target = jnp.zeros_like(flight.aim.target).at[-1].set(lands)
     clock = jnp.stack([0 * h, h, 0 * h, lands.astype(h.dtype)])[:, None]
     plan = flight.plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
@@ -493,18 +569,22 @@ def one_pass(
 ) -> tuple[Flight, Bool[Array, ""]]:
     """Flight after one pass of the stepper, and true if its step is accepted.
 
-    `allowed` are the errors of all rows of the state but q and v. A lane of a batch that does not
-    fly (`flies` false) keeps its state; only the step to try changes, which `toward_sample` then
-    sets anew.
+    `allowed` are the errors of all rows of the state but q and v. A lane of a batch
+    that does not fly (`flies` false) keeps its state; only the step to try changes,
+    which `toward_sample` then sets anew.
     """
     state = flight.state
     flow = dataclasses.replace(
         flow,
         sample=next_sample(targets, flight.sample),
-        sizes=jax.lax.stop_gradient(_errors(flow, settings, allowed, flight) / flow.rtol)[:, None],
+        sizes=jax.lax.stop_gradient(
+            _errors(flow, settings, allowed, flight) / flow.rtol
+        )[:, None],
     )
     # passes are counted here: their number does not lower the tolerance
-    carry = stepper.StepperState(_rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0))
+    carry = stepper.StepperState(
+        _rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0)
+    )
     after, accept = stepper.advance(flow, carry, 2)
     accept = accept[0, 0] & flies
     landed = flight.aim.target[:, 0] & accept  # margins that the step has brought to 0
@@ -516,9 +596,12 @@ def one_pass(
     steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
     vanishes = flies & ~accept & (after.step.clock[1, 0] < _smallest_step(targets))
     # what an event or a sample shortens says nothing of the steps after it
-    tried, lands = flight.aim.clock[1, 0], flight.aim.clock[3, 0] > 0
+    tried = flight.aim.clock[1, 0]
+    lands = flight.aim.clock[3, 0] > 0
     proposed = after.step.clock[1, 0]
-    longer = jnp.where(tried < flight.free, jnp.maximum(proposed, FORGET * flight.free), proposed)
+    longer = jnp.where(
+        tried < flight.free, jnp.maximum(proposed, FORGET * flight.free), proposed
+    )
     free = jnp.where(accept & ~lands, jax.lax.stop_gradient(longer), flight.free)
     moved = flight._replace(
         state=state,
@@ -537,7 +620,8 @@ def one_pass(
     begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
     aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
-    # the stepper keeps its plan for a landing, a step in the root of time, and a rejected one
+    # the stepper keeps its plan for a landing, a step in the root of time, and a
+    # rejected one
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
     return moved._replace(aim=aim, plan=plan), accept
@@ -553,13 +637,17 @@ def out_of_range(system: System, at: State) -> Bool[Array, ""]:
 def status_at_start(
     system: System, at: State, end: Float[Array, ""], closed_below: Any
 ) -> Int[Array, ""]:
-    """Status code of a motion that begins in this state and shall last until `end` [s]."""
+    """Status code of a motion that begins in this state and shall last until `end`
+    [s].
+    """
     allowed = jnp.maximum(closed_below, system.body.overlap)
     penetrates = jnp.any(recorded_gaps(system, at.q, at.t) < -allowed)
     status = jnp.where(penetrates, CODE["penetration"], CODE["ok"])
     status = jnp.where(out_of_range(system, at), CODE["out_of_range"], status)
     status = jnp.where(end <= at.t, CODE["backward"], status)
-    finite = jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
+    finite = (
+        jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
+    )
     return jnp.where(finite, status, CODE["not_finite"]).astype(jnp.int32)
 
 
@@ -571,7 +659,8 @@ def _rows(flow: MotionFlow, state: State) -> Float[Array, "rows 1"]:
 def _reached(
     flow: MotionFlow, aim: stepper.Step, y: Float[Array, "rows 1"]
 ) -> tuple[State, Bool[Array, " jumps"]]:
-    """State at the end of a step from its rows, `projected`, and contacts whose normal jumped.
+    """State at the end of a step from its rows, `projected`, and contacts whose normal
+    jumped.
 
     On a sample t is that of the sample to the last digit.
     """
@@ -580,25 +669,35 @@ def _reached(
 
 
 def _errors(
-    flow: MotionFlow, settings: Settings, allowed: Float[Array, " others"], flight: Flight
+    flow: MotionFlow,
+    settings: Settings,
+    allowed: Float[Array, " others"],
+    flight: Flight,
 ) -> Float[Array, " rows"]:
     """Errors that a step of length h may make in each row.
 
-    Equation: `atol + rtol (|q| + h |q'|)`, v likewise, by sizes within the step as they may cross
-    0; then the `allowed` ones of other rows of the state, and those of `error_only_rows`.
+    Equation: `atol + rtol (|q| + h |q'|)`, v likewise, by sizes within the step as they
+    may cross 0; then the `allowed` ones of other rows of the state, and those of
+    `error_only_rows`.
     """
-    system, state, h = flow.system, flight.state, flight.plan[0, 0]
+    system = flow.system
+    state = flight.state
+    h = flight.plan[0, 0]
     push = user_force(system, state.q, state.v, state.t)
     rates = free_acceleration(system, state.q, state.v, push, mass_at(system, state.q))
     of_q = jnp.abs(state.q) + h * jnp.abs(system.body.rates(state.q, state.v))
     of_v = jnp.abs(state.v) + h * jnp.abs(rates)
     errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
-    return jnp.concatenate([*errors, *flow.errors_of_error_only_rows(settings, state, h, of_q)])
+    return jnp.concatenate(
+        [*errors, *flow.errors_of_error_only_rows(settings, state, h, of_q)]
+    )
 
 
 def _smallest_step(targets: Float[Array, " S"]) -> Float[Array, ""]:
     """Length [s] below which a step does not move time any more."""
-    return not_rounding(SMALLEST_STEP, targets.dtype) * (jnp.abs(targets[0]) + jnp.abs(targets[-1]))
+    return not_rounding(SMALLEST_STEP, targets.dtype) * (
+        jnp.abs(targets[0]) + jnp.abs(targets[-1])
+    )
 
 
 def allowed_errors(
@@ -606,23 +705,30 @@ def allowed_errors(
 ) -> Float[Array, " rows"]:
     """Errors allowed in all rows of the state but q and v: time, works [J], contacts.
 
-    Equation: `share (|M v'| . e_q + |M v| . e_v)`, the work of the errors `e = atol + rtol |.|` of
-    q and v; at least atol; time may err by anything, as it is integrated exactly.
+    Equation: `share (|M v'| . e_q + |M v| . e_v)`, the work of the errors
+    `e = atol + rtol |.|` of q and v; at least atol; time may err by anything, as it is
+    integrated exactly.
     """
     mass = mass_at(system, at.q)
-    free = free_acceleration(system, at.q, at.v, user_force(system, at.q, at.v, at.t), mass)
+    free = free_acceleration(
+        system, at.q, at.v, user_force(system, at.q, at.v, at.t), mass
+    )
     both = jnp.stack([free, at.v], axis=1)
-    pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)  # |M v'|, |M v|
+    # |M v'|, |M v|
+    pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
     of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
     if system.body.coordinates is not None:  # of displacements
         of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
     ledger = share * (of_q @ pushed[:, 0] + of_v @ pushed[:, 1])
     rows = packed(at).shape[0] - at.q.shape[0] - at.v.shape[0]
     # positive even without motion or forces
-    return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)  # time: none
+    # time: none
+    return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)
 
 
-def roundings(margins: Float[Array, " k"], targets: Float[Array, " S"]) -> Float[Array, " margins"]:
+def roundings(
+    margins: Float[Array, " k"], targets: Float[Array, " S"]
+) -> Float[Array, " margins"]:
     """Roundings of margins, and last that of the time to the next sample; none is 0."""
     least = precision(targets.dtype).tiny ** 0.5
     each = jnp.append(margins, _smallest_step(targets))
@@ -640,18 +746,23 @@ def flow_of(
 ) -> MechanicalFlow:
     """Flow from this state with these modes; `one_pass` sets `sample` and `sizes`.
 
-    Roundings of margins: `gap_rounding` of gaps [m], a share of the acceleration of normal forces
-    and of the cone, of the speed of slip.
+    Roundings of margins: `gap_rounding` of gaps [m], a share of the acceleration of
+    normal forces and of the cone, of the speed of slip.
     """
     share = rest_acceleration(state.q.dtype)
     slack = share * scales.acceleration
     normal = jnp.where(modes.active, slack, settings.gap_rounding)
     stuck = modes.stick | (modes.sign == BEGINS)
     friction = jnp.where(stuck, slack, share * scales.speed)
-    margins = jnp.concatenate([normal, friction]) if settings.friction else normal
-    rounded, longest = roundings(margins, targets), longest_step(system, targets)
+    if settings.friction:
+        margins = jnp.concatenate([normal, friction])
+    else:
+        margins = normal
+    rounded = roundings(margins, targets)
+    longest = longest_step(system, targets)
     blank = jnp.zeros((1, 1), state.q.dtype)
-    # where contacts that were held not quite closed are closed, redundant ones come to lie below
+    # where contacts that were held not quite closed are closed, redundant ones come to
+    # lie below
     below = jax.lax.stop_gradient(jnp.minimum(gaps(system, state.q, state.t), 0.0))
     axes = None
     if mu is not None and settings.spatial:

@@ -23,44 +23,54 @@ from jimpact.tools.checks import (
 )
 from jimpact.tools.precision import check_rtol
 
-# Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes.
-# Ten times more, and nobody is warned of that.
+# Contacts of a pile above which motions by events warn: 1 100 compile for more than two
+# minutes. Ten times more, and nobody is warned of that.
 MANY = 200
-TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
-# Share of the largest gap velocity: a slower contact that is pressed back remains closed. Ten times
-# more passes an accumulation a few impacts earlier, and loses a hundred times the energy there.
+# rtol, atol of the flights
+TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}
+# Share of the largest gap velocity: a slower contact that is pressed back remains
+# closed. Ten times more passes an accumulation a few impacts earlier, and loses a
+# hundred times the energy there.
 SLOW = 1e-6
 MOST_STEPS = np.iinfo(np.int32).max  # of time stepping: they are counted in 32 bits
-MAX_STEPS = 100_000  # of the flights by default; ten times more only delays the status `max_steps`
+# of the flights by default; ten times more only delays the status `max_steps`
+MAX_STEPS = 100_000
 
 
 @dataclass(frozen=True)
 class EventDriven:
-    """Flights that land on each event, impacts in no time; 'events' is this with its defaults.
+    """Flights that land on each event, impacts in no time; 'events' is its default.
 
-    Equation: between events that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
-    are closed and at rest.
+    Equation: between events that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at
+    contacts that are closed and at rest.
 
     Args:
         rtol: relative tolerance of the flights; None: 1e-10, in single precision 1e-5.
         atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
-        closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9, or 80
-            roundings of the largest coordinate or gap at the start, if that is more.
-        slow: repeated impacts with decreasing speed (accumulations) are cut short: a contact that
-            leaves slower than this share of the largest gap velocity so far, and would be pressed
-            back, remains closed. For contacts that share a body the limit is `sqrt(slow)`
-            (docs/motions_reference.md). `Motion.events` estimates the skipped time.
+        closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9,
+            or 80 roundings of the largest coordinate or gap at the start, if that is
+            more.
+        slow: repeated impacts with decreasing speed (accumulations) are cut short: a
+            contact that leaves slower than this share of the largest gap velocity so
+            far, and would be pressed back, remains closed. For contacts that share a
+            body the limit is `sqrt(slow)` (docs/motions_reference.md). `Motion.events`
+            estimates the skipped time.
         max_steps: total integrator steps.
-        progress: seconds after which a bar on stderr shows the share of the duration that is done,
-            after each run of 500 events; True: at once, False: never, None: after two seconds, and
-            only on a terminal.
+        progress: seconds after which a bar on stderr shows the share of the duration
+            that is done, after each run of 500 events; True: at once, False: never,
+            None: after two seconds, and only on a terminal.
 
     Raises:
         ValueError: values out of range.
 
     >>> import jimpact as ji
-    >>> ball, coarse = ji.System(ji.Column([1.0]), gravity=True), ji.EventDriven(slow=0.1)
-    >>> motion = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0, method=coarse, samples=3)
+    >>> ball, coarse = (
+    ...     ji.System(ji.Column([1.0]), gravity=True),
+    ...     ji.EventDriven(slow=0.1),
+    ... )
+    >>> motion = ji.simulate(
+    ...     ball, ji.Newton(0.8), [1.0], [0.0], 5.0, method=coarse, samples=3
+    ... )
     >>> int(motion.events.count)
     11
     """
@@ -80,14 +90,14 @@ class EventDriven:
 
 @dataclass(frozen=True)
 class ContactForces:
-    """The forces of a `Compliant` law act throughout: contacts take time, and may be penetrated.
+    """The forces of a `Compliant` law act throughout: contacts take time, and give way.
 
     Equation: `M v' = h + N F(f, f')`, the force F of the law at every gap f below zero.
 
     Args:
         rtol, atol, max_steps, progress: as of `EventDriven`.
-        until_apart: end where all contacts are open and none closes, with status `ok`: an impact
-            whose geometry turns. Its outcome is that of the last event.
+        until_apart: end where all contacts are open and none closes, with status `ok`:
+            an impact whose geometry turns. Its outcome is that of the last event.
 
     Raises:
         ValueError: values out of range.
@@ -114,13 +124,14 @@ class ContactForces:
 class TimeStepping:
     """Moreau-Jean steps of equal length, for many contacts.
 
-    Equation: `M (v+ - v-) = h dt + N p`, p that of the law at the contacts that are closed in the
-    middle of the step.
+    Equation: `M (v+ - v-) = h dt + N p`, p that of the law at the contacts that are
+    closed in the middle of the step.
 
     Args:
         step: [s]; those between two samples are equal, none is longer.
         closed_below: as of `EventDriven`.
-        progress: seconds after which stderr says that the motion runs, see `EventDriven`.
+        progress: seconds after which stderr says that the motion runs, see
+            `EventDriven`.
 
     Raises:
         ValueError: values out of range.
@@ -129,7 +140,9 @@ class TimeStepping:
 
     >>> import jimpact as ji
     >>> ball, steps = ji.System(ji.Column([1.0]), gravity=True), ji.TimeStepping(1e-3)
-    >>> motion = ji.simulate(ball, ji.Moreau(0.0), [0.1], [0.0], 1.0, method=steps, samples=2)
+    >>> motion = ji.simulate(
+    ...     ball, ji.Moreau(0.0), [0.1], [0.0], 1.0, method=steps, samples=2
+    ... )
     >>> abs(float(motion.velocity[-1, 0])) < 1e-12
     True
     """
@@ -140,18 +153,22 @@ class TimeStepping:
 
     def __post_init__(self) -> None:
         if self.step is None or is_traced(self.step):
-            raise ValueError("Argument `step` must be a number, for method 'time_stepping'.")
+            raise ValueError(
+                "Argument `step` must be a number, for method 'time_stepping'."
+            )
         check_shape("step", self.step, (), "one number")
         check_values("step", self.step, low=0.0, open_low=True)
         check_values("closed_below", self.closed_below, low=0.0, open_low=True)
 
-    def contacts(self, system: System, law: Law, q: Any, v: Any, t: Any = 0.0) -> PileContacts:
+    def contacts(
+        self, system: System, law: Law, q: Any, v: Any, t: Any = 0.0
+    ) -> PileContacts:
         """The contacts of a pile, and their impulses, in the step that begins at q, v.
 
-        Equation: `0 <= p _|_ gamma' + w >= 0`, `|p_t| <= mu p`, as in a motion. In a heap at rest
-        `impulse / step` are the contact forces; without forces of the system, and with a step in
-        which nothing moves far, it is an impact by Moreau's law, with friction, on a packing of any
-        size.
+        Equation: `0 <= p _|_ gamma' + w >= 0`, `|p_t| <= mu p`, as in a motion. In a
+        heap at rest `impulse / step` are the contact forces; without forces of the
+        system, and with a step in which nothing moves far, it is an impact by Moreau's
+        law, with friction, on a packing of any size.
 
         Args:
             system: of a body with many contacts (`Bodies`).
@@ -161,15 +178,19 @@ class TimeStepping:
             t: time at the start of the step [s].
 
         Returns:
-            `PileContacts`: bodies, normals, impulses, velocity after the step. Not differentiable,
-            not inside jit.
+            `PileContacts`: bodies, normals, impulses, velocity after the step. Not
+            differentiable, not inside jit.
 
         Raises:
-            ValueError: as of `simulate`; a system without many contacts, no contact in this step.
+            ValueError: as of `simulate`; a system without many contacts, no contact in
+                this step.
 
         >>> import jimpact as ji
         >>> discs = ji.Bodies([ji.Disc(0.1, 1.0), ji.Disc(0.1, 2.0)], room=8)
-        >>> system, q = ji.System(discs, gravity=10.0), discs.at([[0.0, 0.3], [0.0, 0.1]])
+        >>> system, q = (
+        ...     ji.System(discs, gravity=10.0),
+        ...     discs.at([[0.0, 0.3], [0.0, 0.1]]),
+        ... )
         >>> found = ji.TimeStepping(1e-3).contacts(system, ji.Moreau(0.0), q, [0.0] * 6)
         >>> found.bodies.tolist(), [round(float(p) / 1e-3, 3) for p in found.impulse]
         ([[0, 1], [1, -1]], [10.0, 30.0])
@@ -186,7 +207,9 @@ METHODS: dict[str, type[Any]] = {
 }
 
 
-def as_method(method: str | Method, step: float | None = None, **options: Any) -> Method:
+def as_method(
+    method: str | Method, step: float | None = None, **options: Any
+) -> Method:
     """Method object for the argument `method` of `simulate`: itself, or that of a word.
 
     `options` are those of the word's class; `step` belongs to 'time_stepping' alone.
@@ -194,13 +217,16 @@ def as_method(method: str | Method, step: float | None = None, **options: Any) -
     if isinstance(method, Method):
         if step is not None:
             raise ValueError(
-                "Argument `step` must be left out where `method` is an object: a `TimeStepping` "
-                f"has its own, and others take none, but `method` has value {short_repr(method)}."
+                "Argument `step` must be left out where `method` is an object: a "
+                "`TimeStepping` "
+                f"has its own, and others take none, but `method` has value "
+                f"{short_repr(method)}."
             )
         return method
     if not isinstance(method, str):
         raise TypeError(
-            f"Argument `method` must be one of {', '.join(METHODS)} or an object of `EventDriven`, "
+            f"Argument `method` must be one of {', '.join(METHODS)} or an object of "
+            f"`EventDriven`, "
             f"`TimeStepping` or `ContactForces`, but has value {short_repr(method)}."
         )
     check_choice("method", method, tuple(METHODS))
@@ -208,7 +234,8 @@ def as_method(method: str | Method, step: float | None = None, **options: Any) -
         options["step"] = step
     elif step is not None:
         raise ValueError(
-            "Argument `step` must be left out but for method='time_stepping', which it belongs to; "
+            "Argument `step` must be left out but for method='time_stepping', which it "
+            "belongs to; "
             f"`method` has value {method!r}."
         )
     made: Method = METHODS[method](**options)
@@ -220,7 +247,9 @@ def name_of(method: Method) -> str:
     return next(name for name, kind in METHODS.items() if isinstance(method, kind))
 
 
-def substeps_of(method: TimeStepping, start: Any, end: Any, samples: int) -> Int[Array, ""]:
+def substeps_of(
+    method: TimeStepping, start: Any, end: Any, samples: int
+) -> Int[Array, ""]:
     """Number of equal steps between two samples, so that none is longer than `step`."""
     if is_traced((start, end)):
         raise ValueError("Argument `t_end` must not be traced in time stepping.")
@@ -228,7 +257,8 @@ def substeps_of(method: TimeStepping, start: Any, end: Any, samples: int) -> Int
     count = max(1.0, np.ceil(between / float(method.step) * (1 - 1e-9)))
     if count * (samples - 1) > MOST_STEPS:
         raise ValueError(
-            f"Argument `step` must give at most {MOST_STEPS} steps, but has value {method.step:g}."
+            f"Argument `step` must give at most {MOST_STEPS} steps, but has value "
+            f"{method.step:g}."
         )
     return jnp.asarray(int(count), jnp.int32)  # an array: one program for all steps
 
@@ -241,10 +271,11 @@ def start_by(
     v: Float[Array, "..."],
     t_end: Any,
 ) -> Start:
-    """Checked start of a motion by this method; with contact forces it may be in penetration.
+    """Checked start of a motion by this method; with contact forces it may be in
+    penetration.
 
-    Warns of piles whose events take long. Raises a ValueError as `start_of`, and for friction of a
-    pile, which only time stepping has.
+    Warns of piles whose events take long. Raises a ValueError as `start_of`, and for
+    friction of a pile, which only time stepping has.
     """
     if isinstance(method, ContactForces):
         start = start_of(system, law, q, v, t_end, may_penetrate=True)
@@ -252,25 +283,34 @@ def start_by(
         start = start_of(system, law, q, v, t_end, method.closed_below)
     if isinstance(method, TimeStepping) or not is_pile(system):
         return start
-    name, body = name_of(method), type(system.body).__name__
+    name = name_of(method)
+    body = type(system.body).__name__
     if start.friction is not None:
         raise ValueError(
-            f"Argument `friction` must be 0 for the contacts of {body} by method={name!r}: use "
+            f"Argument `friction` must be 0 for the contacts of {body} by "
+            f"method={name!r}: use "
             "method='time_stepping', or name the `pairs` of few `Bodies`."
         )
     if start.contacts > MANY:
         warnings.warn(
-            f"Argument `method` {name!r} computes all {start.contacts} contacts of {body} at each "
-            "event, and compiles for minutes: use method='time_stepping' for many bodies.",
+            f"Argument `method` {name!r} computes all {start.contacts} contacts of "
+            f"{body} at each "
+            "event, and compiles for minutes: use method='time_stepping' for many "
+            "bodies.",
             stacklevel=4,  # the line that calls `simulate`, through `full_precision`
         )
     return start
 
 
-def tolerances(method: EventDriven | ContactForces, dtype: jnp.dtype) -> tuple[float, float]:
-    """Relative and absolute tolerance of the flights, those of the precision by default."""
+def tolerances(
+    method: EventDriven | ContactForces, dtype: jnp.dtype
+) -> tuple[float, float]:
+    """Relative and absolute tolerance of the flights, those of the precision by
+    default.
+    """
     rtol, atol = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
-    rtol = rtol if method.rtol is None else method.rtol
+    if method.rtol is not None:
+        rtol = method.rtol
     if isinstance(method, EventDriven):
         check_rtol(rtol, dtype)
     return rtol, atol if method.atol is None else method.atol

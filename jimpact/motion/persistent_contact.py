@@ -1,9 +1,11 @@
-"""Persistent contact: its modes (open, sliding, sticking), and the forces that keep them.
+"""Persistent contact: its modes (open, sliding, sticking), and the forces that keep
+them.
 
-The modes are frozen between events, so that forces are one linear solve: `rate' = 0` at every
-active contact, and at sticking ones tangentially, too; `lambda_t = -mu lambda_n d` at sliding ones,
-in the direction d of slip. Which modes hold after an event is decided by complementarity of forces
-and accelerations. A contact in space has two rows of slip where one in the plane has one.
+The modes are frozen between events, so that forces are one linear solve: `rate' = 0` at
+every active contact, and at sticking ones tangentially, too;
+`lambda_t = -mu lambda_n d` at sliding ones, in the direction d of slip. Which modes
+hold after an event is decided by complementarity of forces and accelerations. A contact
+in space has two rows of slip where one in the plane has one.
 """
 
 from typing import NamedTuple
@@ -34,39 +36,46 @@ from jimpact.numerics.lcp import solve_lcp
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
-# Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
-# stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
-_RIDGE, _REFINEMENTS = 1e-7, 3
-# Part of its diagonal entry that friction leaves a contact which is about to jam. Ten times more:
-# redundant contacts share by their slip, which derivatives do not see; ten times less: the ridge is
-# felt for longer.
+# Beside a matrix with unit diagonal: it decides where that is singular (redundant
+# contacts that stick), and refinements remove what it changes elsewhere. Much less, and
+# rounding decides, too.
+_RIDGE = 1e-7
+_REFINEMENTS = 3
+# Part of its diagonal entry that friction leaves a contact which is about to jam. Ten
+# times more: redundant contacts share by their slip, which derivatives do not see; ten
+# times less: the ridge is felt for longer.
 _JAMS = 1e-2
-# Without friction masses may differ by as much as rounding lets them; how redundant contacts share
-# the load may err by rounding over this.
+# Without friction masses may differ by as much as rounding lets them; how redundant
+# contacts share the load may err by rounding over this.
 _THIN_RIDGE = 1e-9
-_INDEPENDENT = 3  # frictionless contacts that are taken not to be redundant: legs of a table
-_LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
-# Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
-# motion stay together: bodies that move side by side press on each other by rounding only.
+# frictionless contacts that are taken not to be redundant: legs of a table
+_INDEPENDENT = 3
+# of the pressing force: keeps the weights of contacts without load regular
+_LEAST_SHARE = 1e-3
+# Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration
+# of the motion stay together: bodies that move side by side press on each other by
+# rounding only.
 _REST_ACCELERATION = 1e-11
 BEGINS = 2  # `Modes.sign` of a contact in space whose slip begins
-# Slip in space that grows from rest slower than this part of what friction changes it by only
-# begins: see `slip_in_space.py`. Ten times more: errors a thousand times as large, steps a tenth.
+# Slip in space that grows from rest slower than this part of what friction changes it
+# by only begins: see `slip_in_space.py`. Ten times more: errors a thousand times as
+# large, steps a tenth.
 _BEGINNING = 2e-3
-# Part of the cone that may hold a contact across its slip, as long as that begins. Ten times more:
-# the contact may be held by all of it.
+# Part of the cone that may hold a contact across its slip, as long as that begins. Ten
+# times more: the contact may be held by all of it.
 _LEANING = 0.1
 _PASSES = 3  # choices: contacts whose slip contradicts their choice are re-evaluated
-# A power of rounding: a ridge that redundant contacts need to share their forces. Ten times more
-# would be seen in the forces.
+# A power of rounding: a ridge that redundant contacts need to share their forces. Ten
+# times more would be seen in the forces.
 _FAINT_RIDGE = 3 / 4
 
 
 class Modes(NamedTuple):
     """Mode of each contact: open, or persistent and sticking or sliding.
 
-    `sign` is that of the slip in the plane, -1, 0 or 1. In space, where `slip_in_space.py` has the
-    directions, it is 1 of contacts that slide, and `BEGINS` of those that begin to.
+    `sign` is that of the slip in the plane, -1, 0 or 1. In space, where
+    `slip_in_space.py` has the directions, it is 1 of contacts that slide, and `BEGINS`
+    of those that begin to.
     """
 
     active: Bool[Array, " m"]  # persistent: gap and gap velocity stay 0
@@ -75,7 +84,9 @@ class Modes(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Contact space at one instant: normals first, then tangents where there is friction."""
+    """Contact space at one instant: normals first, then tangents where there is
+    friction.
+    """
 
     normal: Kinematics
     tangent: Kinematics | None
@@ -83,7 +94,8 @@ class Contacts(NamedTuple):
     moved: Float[Array, "n k"]  # M^-1 [N, H]
     delassus: Float[Array, "k k"]  # W = [N, H]^T M^-1 [N, H]
     free: Float[Array, " n"]  # v' without contact forces
-    approach: Float[Array, " k"]  # gap and slip accelerations without contact forces [m/s^2]
+    # gap and slip accelerations without contact forces [m/s^2]
+    approach: Float[Array, " k"]
 
 
 class Forces(NamedTuple):
@@ -127,18 +139,23 @@ def in_space(contacts: Contacts) -> bool:
 
 
 def held_rows(modes: Modes, size: int) -> Bool[Array, " size"]:
-    """True in rows of contact space whose acceleration the modes hold at 0, the first `size` rows.
+    """True in rows of contact space whose acceleration the modes hold at 0, the first
+    `size` rows.
 
-    Normal rows of persistent contacts, tangential ones of those that stick. In space the first row
-    of a contact is along its slip, the second one across it: where slip begins the latter is held.
+    Normal rows of persistent contacts, tangential ones of those that stick. In space
+    the first row of a contact is along its slip, the second one across it: where slip
+    begins the latter is held.
     """
-    m, stick = modes.active.shape[0], modes.active & modes.stick
+    m = modes.active.shape[0]
+    stick = modes.active & modes.stick
     if size == m:
         return modes.active
     if size == 2 * m:
         return jnp.concatenate([modes.active, stick])
     across = stick | (modes.active & (modes.sign == BEGINS))
-    return jnp.concatenate([modes.active, jnp.stack([stick, across], axis=1).reshape(-1)])
+    return jnp.concatenate(
+        [modes.active, jnp.stack([stick, across], axis=1).reshape(-1)]
+    )
 
 
 def contacts_at(
@@ -149,14 +166,16 @@ def contacts_at(
     friction: bool,
     along: Float[Array, "m 2"] | None = None,
 ) -> Contacts:
-    """Contact space at (q, v, t): W = D^T M^-1 D and D^T v' + drift of the directions D = [N, H].
+    """Contact space at (q, v, t): W = D^T M^-1 D and D^T v' + drift of the directions D
+    = [N, H].
 
-    In space, with `along`, tangents are turned: the first one of each contact is along this unit
-    vector in its plane of contact.
+    In space, with `along`, tangents are turned: the first one of each contact is along
+    this unit vector in its plane of contact.
     """
     mass = mass_at(system, q)
     normal, tangent = kinematics(system, q, v, t, friction)
-    directions, drift = normal.gradient, normal.drift
+    directions = normal.gradient
+    drift = normal.drift
     if tangent is not None and along is not None:
         tangent = _turned(tangent, along)
     if tangent is not None:
@@ -165,32 +184,43 @@ def contacts_at(
     moved = solve_mass_matrix(mass, directions)
     free = free_acceleration(system, q, v, user_force(system, q, v, t), mass)
     return Contacts(
-        normal, tangent, directions, moved, directions.T @ moved, free, directions.T @ free + drift
+        normal,
+        tangent,
+        directions,
+        moved,
+        directions.T @ moved,
+        free,
+        directions.T @ free + drift,
     )
 
 
 def with_normal_forces(contacts: Contacts, push: Float[Array, " m"]) -> Contacts:
     """Contact space in which normal forces are `push` [N], whatever friction does.
 
-    Normal rows become `W_jj (lambda_j - push_j) = 0`, without coupling to tangential forces;
-    tangential ones have `W_tn push` in their accelerations.
+    Normal rows become `W_jj (lambda_j - push_j) = 0`, without coupling to tangential
+    forces; tangential ones have `W_tn push` in their accelerations.
     """
     m = len(push)
     size = jnp.diagonal(contacts.delassus)[:m]
     w = contacts.delassus.at[:, :m].set(0.0).at[:m].set(0.0)
     pushed = contacts.approach + contacts.delassus[:, :m] @ push
     return contacts._replace(
-        delassus=w.at[:m, :m].set(jnp.diag(size)), approach=pushed.at[:m].set(-size * push)
+        delassus=w.at[:m, :m].set(jnp.diag(size)),
+        approach=pushed.at[:m].set(-size * push),
     )
 
 
 def slip_frames(along: Float[Array, "m 2"]) -> Float[Array, "m 2 2"]:
-    """Axes (m, axis, component) in each plane of contact: `along`, and at right angles to it."""
+    """Axes (m, axis, component) in each plane of contact: `along`, and at right angles
+    to it.
+    """
     return jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
 
 
 def _turned(tangent: Kinematics, along: Float[Array, "m 2"]) -> Kinematics:
-    """Kinematics along tangents of which the first is `along`, the second at right angles."""
+    """Kinematics along tangents of which the first is `along`, the second at right
+    angles.
+    """
     axes = slip_frames(along)
 
     def turned(rows: Float[Array, "*n t"]) -> Float[Array, "*n t"]:
@@ -204,7 +234,8 @@ def _turned(tangent: Kinematics, along: Float[Array, "m 2"]) -> Kinematics:
 def friction_acceleration(
     contacts: Contacts, mu: Float[Array, " m"], normal: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """Slip acceleration `mu lambda_n W_tt` [m/s^2] that friction can give each contact itself.
+    """Slip acceleration `mu lambda_n W_tt` [m/s^2] that friction can give each contact
+    itself.
 
     `normal` are forces lambda_n [N]; W_tt is the mean over the tangents of the contact.
     """
@@ -212,8 +243,12 @@ def friction_acceleration(
     return mu * normal * by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
 
 
-def cone_margins(contacts: Contacts, mu: Float[Array, " m"], force: Forces) -> Float[Array, " m"]:
-    """Distances `(mu lambda_n - |lambda_t|) W_tt` from the rim of the friction cone [m/s^2]."""
+def cone_margins(
+    contacts: Contacts, mu: Float[Array, " m"], force: Forces
+) -> Float[Array, " m"]:
+    """Distances `(mu lambda_n - |lambda_t|) W_tt` from the rim of the friction cone
+    [m/s^2].
+    """
     assert force.tangential is not None
     m = len(mu)
     sizes = by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
@@ -226,7 +261,8 @@ def slip_begins(
     normal: Float[Array, " m"],
     growth: Float[Array, " m"],
 ) -> Float[Array, " m"]:
-    """Margins `_BEGINNING mu lambda_n W_tt - growth` [m/s^2]: slip begins while they are positive.
+    """Margins `_BEGINNING mu lambda_n W_tt - growth` [m/s^2]: slip begins while they
+    are positive.
 
     `normal` are forces [N], `growth` is the acceleration of the slip [m/s^2].
     """
@@ -248,22 +284,26 @@ def forces(
     """
     m = contacts.normal.value.shape[0]
     if contacts.tangent is None or mu is None:
-        normal = _without_friction(contacts.delassus, -contacts.approach[:, None], modes.active)[
-            :, 0
-        ]
+        normal = _without_friction(
+            contacts.delassus, -contacts.approach[:, None], modes.active
+        )[:, 0]
         return Forces(normal, None, contacts.free + contacts.moved @ normal)
     w, held, drag = _dragged(contacts, mu, modes, slip)
     right = -contacts.approach
     none = jnp.zeros(m, w.dtype)
 
     def shared(_: Int[Array, ""], known: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Forces of held rows; tangential ones are shared by the normal forces of the last pass."""
-        # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
-        # `numerics/friction.py`: they break loose together
+        """Forces of held rows; tangential ones are shared by the normal forces of the
+        last pass.
+        """
+        # redundant sticking contacts share what they hold in proportion to mu lambda_n,
+        # as in `numerics/friction.py`: they break loose together
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
         weight = jnp.concatenate([none + 1, share])
-        return _least(w, right[:, None], held, weight, _sizes(w, contacts.delassus, m))[:, 0]
+        return _least(w, right[:, None], held, weight, _sizes(w, contacts.delassus, m))[
+            :, 0
+        ]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
     both = both.at[m:].add(-(drag * both[:m, None]).reshape(-1))
@@ -271,18 +311,31 @@ def forces(
 
 
 def _dragged(
-    contacts: Contacts, mu: Float[Array, " m"], modes: Modes, slip: Float[Array, "m r"] | None
+    contacts: Contacts,
+    mu: Float[Array, " m"],
+    modes: Modes,
+    slip: Float[Array, "m r"] | None,
 ) -> tuple[Float[Array, "k k"], Bool[Array, " k"], Float[Array, "m r"]]:
-    """Delassus matrix with sliding friction, held rows (k,), and `drag = -lambda_t / lambda_n`.
+    """Delassus matrix with sliding friction, held rows (k,), and
+    `drag = -lambda_t / lambda_n`.
 
-    Equation: the normal force of a contact that slides brings `lambda_t = -mu lambda_n d`: its
-    column of the matrix is `W_n - sum_r W_t mu d`. `drag` is mu d where it slides, else 0.
+    Equation: the normal force of a contact that slides brings
+    `lambda_t = -mu lambda_n d`: its column of the matrix is `W_n - sum_r W_t mu d`.
+    `drag` is mu d where it slides, else 0.
     """
-    m, k = modes.active.shape[0], contacts.delassus.shape[0]
+    m = modes.active.shape[0]
+    k = contacts.delassus.shape[0]
     slides = (modes.active & ~modes.stick)[:, None]
-    along = modes.sign[:, None] if slip is None else slip
+    if slip is None:
+        along = modes.sign[:, None]
+    else:
+        along = slip
     drag = jnp.where(slides, along * mu[:, None], 0.0)
-    pull = (contacts.delassus[:, m:] * drag.reshape(-1)[None]).reshape(k, m, -1).sum(axis=2)
+    pull = (
+        (contacts.delassus[:, m:] * drag.reshape(-1)[None])
+        .reshape(k, m, -1)
+        .sum(axis=2)
+    )
     return contacts.delassus.at[:, :m].add(-pull), held_rows(modes, k), drag
 
 
@@ -292,11 +345,12 @@ def regularity(
     modes: Modes,
     slip: Float[Array, "m r"] | None = None,
 ) -> Float[Array, ""]:
-    """Determinant of the held rows of `_dragged`, divided by that of W: 1 without sliding friction.
+    """Determinant of the held rows of `_dragged`, divided by that of W: 1 without
+    sliding friction.
 
-    Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen to 0 forces
-    that keep the modes do not exist, or elastic contacts would not settle at them; below the root
-    of rounding it counts as 0.
+    Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen
+    to 0 forces that keep the modes do not exist, or elastic contacts would not settle
+    at them; below the root of rounding it counts as 0.
     """
     w, held, _ = _dragged(contacts, mu, modes, slip)
     scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(contacts.delassus), 1.0))
@@ -319,12 +373,14 @@ def _sizes(
 ) -> Float[Array, " k"]:
     """Diagonal that scales the equations of `_least`: W_jj, which slip does not change.
 
-    A contact about to jam has that with friction, `dragged`: it would be less than the ridge beside
-    W_jj.
+    A contact about to jam has that with friction, `dragged`: it would be less than the
+    ridge beside W_jj.
     """
-    with_friction, without = jnp.diagonal(dragged), jnp.diagonal(delassus)
+    with_friction = jnp.diagonal(dragged)
+    without = jnp.diagonal(delassus)
     sizes = jnp.where(with_friction < _JAMS * without, with_friction, without)
-    # both rows of slip of a contact alike: else its share would depend on how they are turned
+    # both rows of slip of a contact alike: else its share would depend on how they are
+    # turned
     rows = by_contact(sizes[m:], m)
     return jnp.concatenate([sizes[:m], jnp.repeat(rows.mean(axis=1), rows.shape[1])])
 
@@ -334,11 +390,13 @@ def _without_friction(
 ) -> Float[Array, "k c"]:
     """Solution x of `w x = right` on held rows, 0 elsewhere; w is symmetric.
 
-    Up to `_INDEPENDENT` contacts are taken not to be redundant and solved directly, others by
-    `_least`.
+    Up to `_INDEPENDENT` contacts are taken not to be redundant and solved directly,
+    others by `_least`.
     """
     if len(held) > _INDEPENDENT:
-        return _least(w, right, held, jnp.ones_like(right[:, 0]), jnp.diagonal(w), _THIN_RIDGE)
+        return _least(
+            w, right, held, jnp.ones_like(right[:, 0]), jnp.diagonal(w), _THIN_RIDGE
+        )
     k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(len(held), dtype=w.dtype))
     return solve_definite(k, jnp.where(held[:, None], right, 0.0))
 
@@ -353,9 +411,10 @@ def _least(
 ) -> Float[Array, "k c"]:
     """Solution x (k, c) of `w x = right` on the rows that are held; 0 elsewhere.
 
-    Where that has many solutions, the one of least `sum size_j x_j^2 / weight_j` if w is symmetric:
-    by a `ridge` beside the matrix scaled to unit diagonal, whose effect refinements remove.
-    Derivatives take `size` for constant: it must not change with slip.
+    Where that has many solutions, the one of least `sum size_j x_j^2 / weight_j` if w
+    is symmetric: by a `ridge` beside the matrix scaled to unit diagonal, whose effect
+    refinements remove. Derivatives take `size` for constant: it must not change with
+    slip.
     """
     scale = jnp.where(held, 1 / jnp.sqrt(size), 1.0)
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
@@ -376,13 +435,14 @@ def constraint_impulse(
 ) -> Float[Array, "k ..."]:
     """Impulses p that bring `rates` to 0: `W p = -rates` in held rows, the least ones.
 
-    Rates have k rows, or m of normals alone; impulses have k. `contacts.moved @ p` is the change of
-    velocity, or of position where `rates` are gaps (to first order).
+    Rates have k rows, or m of normals alone; impulses have k. `contacts.moved @ p` is
+    the change of velocity, or of position where `rates` are gaps (to first order).
     """
     friction = contacts.tangent is not None and mu is not None
     size = rates.shape[0]
     held = held_rows(modes, size if friction else len(modes.active))[:size]
-    w, columns = contacts.delassus[:size, :size], rates.reshape(size, -1)
+    w = contacts.delassus[:size, :size]
+    columns = rates.reshape(size, -1)
     if friction:
         p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]), jnp.diagonal(w))
     else:
@@ -416,16 +476,18 @@ def slip_margins(
     lasts: Float[Array, ""],
     speed_scale: Float[Array, ""],
 ) -> Float[Array, " m"]:
-    """Margins that are positive while a contact slides: `u_1 lasts`, slip times `regularity`.
+    """Margins that are positive while a contact slides: `u_1 lasts`, slip times
+    `regularity`.
 
-    u_1 is the slip along its direction, in space the first tangential row; `lasts` is what is left
-    of `regularity` above its bound. Where slip only begins (`BEGINS`), with its growth u_1' and
-    `c = mu lambda_n W_tt`, the least of three accelerations [m/s^2]; that mode ends where
+    u_1 is the slip along its direction, in space the first tangential row; `lasts` is
+    what is left of `regularity` above its bound. Where slip only begins (`BEGINS`),
+    with its growth u_1' and `c = mu lambda_n W_tt`, the least of three accelerations
+    [m/s^2]; that mode ends where
 
     - slip falls back to 0: `c u_1 / speed_scale + max(u_1', 0)`;
     - it grows faster: `_BEGINNING c - u_1'`;
-    - the contact leans aside: `c (1 - |lambda_t2| / (_LEANING mu lambda_n))`, lambda_t2 the force
-      across the slip.
+    - the contact leans aside: `c (1 - |lambda_t2| / (_LEANING mu lambda_n))`, lambda_t2
+      the force across the slip.
     """
     m = len(mu)
     assert contacts.tangent is not None
@@ -440,18 +502,28 @@ def slip_margins(
     growth = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)[:, 0]
     by_friction = friction_acceleration(contacts, mu, force.normal)
     some = speed_scale > 0
-    falls = by_friction * slip / jnp.where(some, speed_scale, 1.0) + jnp.maximum(growth, 0.0)
-    across = by_contact(force.tangential, m)[:, 1] / jnp.where(force.normal > 0, force.normal, 1.0)
-    aside = by_friction - jnp.abs(across) * by_friction / (_LEANING * jnp.where(mu > 0, mu, 1.0))
+    falls = by_friction * slip / jnp.where(some, speed_scale, 1.0) + jnp.maximum(
+        growth, 0.0
+    )
+    across = by_contact(force.tangential, m)[:, 1] / jnp.where(
+        force.normal > 0, force.normal, 1.0
+    )
+    aside = by_friction - jnp.abs(across) * by_friction / (
+        _LEANING * jnp.where(mu > 0, mu, 1.0)
+    )
     faster = slip_begins(contacts, mu, force.normal, growth)
-    return jnp.where(modes.sign == BEGINS, jnp.minimum(jnp.minimum(falls, faster), aside), ends)
+    return jnp.where(
+        modes.sign == BEGINS, jnp.minimum(jnp.minimum(falls, faster), aside), ends
+    )
 
 
 class ModeChoice(NamedTuple):
-    """Modes of the contacts after an event, as complementarity of forces and accelerations asks.
+    """Modes of the contacts after an event, as complementarity of forces and
+    accelerations asks.
 
-    Of several solutions that one is taken which sticks most. But a contact does not go on sliding
-    where elastic contacts would not settle at such forces (see `regularity`): it parts.
+    Of several solutions that one is taken which sticks most. But a contact does not go
+    on sliding where elastic contacts would not settle at such forces (see
+    `regularity`): it parts.
     """
 
     modes: Modes
@@ -475,17 +547,18 @@ def choose_with_friction(
     """Modes of the contacts that touch at rest, with Coulomb's friction.
 
     Equation: `a = W lambda + approach`, `0 <= a_n _|_ lambda_n >= 0`, and tangentially
-    `lambda_t = -mu lambda_n u / |u|` where a contact slides, elsewhere `|lambda_t| <= mu lambda_n`
-    with `lambda_t = -mu lambda_n a_t / |a_t|` where slip starts. Up to `_PASSES` problems are
-    solved: a contact whose slip contradicts the direction assumed for it is left free in the next.
+    `lambda_t = -mu lambda_n u / |u|` where a contact slides, elsewhere
+    `|lambda_t| <= mu lambda_n` with `lambda_t = -mu lambda_n a_t / |a_t|` where slip
+    starts. Up to `_PASSES` problems are solved: a contact whose slip contradicts the
+    direction assumed for it is left free in the next.
 
     Args:
         contacts: contact space.
         mu: coefficients of friction.
         before: modes up to now.
         touching: gap and gap velocity are 0.
-        released: (2 m,) normal, then tangential constraints that have just ended: they hold again
-            only with a force, not by rounding.
+        released: (2 m,) normal, then tangential constraints that have just ended: they
+            hold again only with a force, not by rounding.
         sliding: the slip is not 0.
         slack: gap accelerations [m/s^2] below it are rounding.
     """
@@ -494,32 +567,39 @@ def choose_with_friction(
     slip_began = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
     problem = _ModeProblem(contacts, mu, touching, released, sliding, slip_began, slack)
     expected, directions = _expected_modes(problem, before)
-    no, one = jnp.asarray(False), jnp.ones_like(slack)
+    no = jnp.asarray(False)
+    one = jnp.ones_like(slack)
     start = _ModeTrial(expected, directions, touching, one, no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(
         lambda trial: ~trial.done & (trial.passes < _PASSES),
         lambda trial: _next_trial(problem, trial),
         start,
     )
-    parts, several = touching & ~end.may_press, end.several & end.solved
+    parts = touching & ~end.may_press
+    several = end.several & end.solved
     return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
 
 
 class _ModeProblem(NamedTuple):
-    """Data of the problem of `choose_with_friction`, without derivatives; see its arguments."""
+    """Data of the problem of `choose_with_friction`, without derivatives; see its
+    arguments.
+    """
 
     contacts: Contacts
     mu: Float[Array, " m"]
     touching: Bool[Array, " m"]
     released: Bool[Array, " 2*m"]
     sliding: Bool[Array, " m"]
-    # a contact had mode BEGINS: now it slides or sticks, and no other one gets that mode
+    # a contact had mode BEGINS: now it slides or sticks, and no other one gets that
+    # mode
     slip_began: Bool[Array, ""]
     slack: Float[Array, ""]
 
     @property
     def sticking_modes(self) -> Modes:
-        """Modes in which all touching contacts are persistent, and stick unless they slide."""
+        """Modes in which all touching contacts are persistent, and stick unless they
+        slide.
+        """
         ones = jnp.ones(len(self.mu), self.mu.dtype)
         return Modes(self.touching, self.touching & ~self.sliding, ones)
 
@@ -528,7 +608,8 @@ class _ModeTrial(NamedTuple):
     """Solution of one complementarity problem of `choose_with_friction`."""
 
     modes: Modes
-    known: Float[Array, "m r"]  # directions of slip that are assumed, 0 where they are solved for
+    # directions of slip that are assumed, 0 where they are solved for
+    known: Float[Array, "m r"]
     may_press: Bool[Array, " m"]  # contacts that take part; others are taken to open
     regularity: Float[Array, ""]
     several: Bool[Array, ""]
@@ -537,21 +618,32 @@ class _ModeTrial(NamedTuple):
     passes: Int[Array, ""]
 
 
-def _expected_modes(problem: _ModeProblem, before: Modes) -> tuple[Modes, Float[Array, "m r"]]:
-    """Modes to try first: as before, but for constraints that ended; directions of known slip.
+def _expected_modes(
+    problem: _ModeProblem, before: Modes
+) -> tuple[Modes, Float[Array, "m r"]]:
+    """Modes to try first: as before, but for constraints that ended; directions of
+    known slip.
 
-    The direction of a contact that slides is that of its slip u; slip starts against the last force
-    of sticking, `-lambda_t / |lambda_t|`; 0 where the direction is to be solved for.
+    The direction of a contact that slides is that of its slip u; slip starts against
+    the last force of sticking, `-lambda_t / |lambda_t|`; 0 where the direction is to be
+    solved for.
     """
     contacts, mu, touching, released, sliding, _, slack = problem
     assert contacts.tangent is not None
-    m, spatial = len(mu), in_space(contacts)
+    m = len(mu)
+    spatial = in_space(contacts)
     slid = before.active & ~before.stick
-    broken = released[m:] & before.stick & ~sliding  # friction has reached the cone: slip starts
+    # friction has reached the cone: slip starts
+    broken = released[m:] & before.stick & ~sliding
     ended = jnp.any(released[m:] & slid)  # slip of a contact has come to 0
-    # where sticking breaks at one contact of a body, those that began to slide before go on
+    # where sticking breaks at one contact of a body, those that began to slide before
+    # go on
     goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
-    starts = broken | goes_on if spatial else broken  # in space directions are not remembered
+    # in space directions are not remembered
+    if spatial:
+        starts = broken | goes_on
+    else:
+        starts = broken
     stick = ~sliding & (starts | ~goes_on)
     now = Modes(touching, stick, jnp.where(goes_on, before.sign, 0.0))
     moves = direction(by_contact(contacts.tangent.rate, m))
@@ -564,38 +656,54 @@ def _expected_modes(problem: _ModeProblem, before: Modes) -> tuple[Modes, Float[
     held, stuck = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     assert held.tangential is not None
     against = by_contact(held.tangential, m)
-    against = -direction(against) if spatial else jnp.where(against > 0, -1.0, 1.0)
+    if spatial:
+        against = -direction(against)
+    else:
+        against = jnp.where(against > 0, -1.0, 1.0)
     if spatial:  # redundant contacts that share equally break loose together
         at_rim = (
-            before.active & before.stick & ~sliding & (cone_margins(contacts, mu, stuck) <= slack)
+            before.active
+            & before.stick
+            & ~sliding
+            & (cone_margins(contacts, mu, stuck) <= slack)
         )
         starts = starts | (at_rim & jnp.any(broken))
     return now, jnp.where(starts[:, None], against, slides)
 
 
 def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
-    """Modes by the problem of `choose_with_friction`, with directions and contacts of `last`.
+    """Modes by the problem of `choose_with_friction`, with directions and contacts of
+    `last`.
 
-    Of what it contradicts the next trial is free: assumed directions against which slip starts, and
-    a contact that would slide although its forces are singular (it is wedged) where another
-    solution exists.
+    Of what it contradicts the next trial is free: assumed directions against which slip
+    starts, and a contact that would slide although its forces are singular (it is
+    wedged) where another solution exists.
     """
     contacts, mu, touching, released, sliding, slip_began, slack = problem
-    m, known = len(mu), last.known
-    dtype, diagonal = known.dtype, jnp.diagonal(contacts.delassus)[:m]
-    # rows of contacts that take part: normals (m), then their tangents; others get lambda = 0
+    m = len(mu)
+    known = last.known
+    dtype = known.dtype
+    diagonal = jnp.diagonal(contacts.delassus)[:m]
+    # rows of contacts that take part: normals (m), then their tangents; others get
+    # lambda = 0
     rows = jnp.concatenate([last.may_press, jnp.repeat(last.may_press, known.shape[1])])
     eye = jnp.eye(len(rows), dtype=dtype)
     w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
     free = jnp.where(rows, contacts.approach, 0.0)
     solution = solve(
-        w, free[:m], free[m:], mu * jnp.ones(m, dtype), complementary=True,
+        w,
+        free[:m],
+        free[m:],
+        mu * jnp.ones(m, dtype),
+        complementary=True,
         sliding=known.reshape(-1),
-    )  # fmt: skip
+    )
     acceleration = contacts.approach + contacts.delassus @ jnp.concatenate(
         [solution.normal, solution.tangential]
     )
-    along, is_known = by_contact(acceleration[m:], m), length(known) > 0  # (m, r) of the slip
+    # (m, r) of the slip
+    along = by_contact(acceleration[m:], m)
+    is_known = length(known) > 0
     active = last.may_press & (acceleration[:m] <= slack)
     # what has just let go needs a force, as an acceleration, that is no rounding
     active = active & (~released[:m] | (solution.normal * diagonal > slack))
@@ -616,7 +724,8 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
     pressed = jnp.where(solved, active, last.may_press)
     pressing = modes._replace(active=pressed, stick=pressed & ~slips)
     regular = regularity(contacts, mu, pressing, slide)
-    # flights end where the regularity falls to `root`: contacts are wedged from twice that on
+    # flights end where the regularity falls to `root`: contacts are wedged from twice
+    # that on
     wedged = active & slips & (regular <= 2 * precision(dtype).root)
     open_ones_part = jnp.all(~touching | last.may_press | (acceleration[:m] >= -slack))
     return _ModeTrial(
@@ -642,13 +751,15 @@ class Pressed(NamedTuple):
 def pressed_together(
     contacts: Contacts, touching: Bool[Array, " m"], slack: Float[Array, ""]
 ) -> Pressed:
-    """Normal forces of touching contacts: `0 <= lambda _|_ W lambda + approach >= 0`, no friction.
+    """Normal forces of touching contacts: `0 <= lambda _|_ W lambda + approach >= 0`,
+    no friction.
 
     Gap accelerations below `slack` [m/s^2] are rounding.
     """
     contacts = jax.lax.stop_gradient(contacts)
     m = touching.shape[0]
-    w, b = contacts.delassus[:m, :m], jnp.where(touching, contacts.approach[:m], 0.0)
+    w = contacts.delassus[:m, :m]
+    b = jnp.where(touching, contacts.approach[:m], 0.0)
     both = touching[:, None] & touching[None, :]
     eye = jnp.eye(m, dtype=w.dtype)
     # redundant contacts: any of the solutions will do

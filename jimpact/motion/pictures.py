@@ -16,17 +16,26 @@ from jimpact.bodies.base import Body, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
-from jimpact.plot.style import COLOURS, GREY, colour_of, legend_below, new_figure, styled
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    colour_of,
+    legend_below,
+    new_figure,
+    styled,
+)
 from jimpact.tools.checks import check_kind
 
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
-_MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
-_MANY = 20  # up to this number of impacts each is marked by a line; more are a grey block
+# events with a line style of their kind
+_MARKED = ("accumulation", "detachment", "friction")
+# up to this number of impacts each is marked by a line; more are a grey block
+_MANY = 20
 _BASEPOINTS = 1000  # at which a base is drawn
 _LONG = 10  # letters of a word in a legend above a panel of which three take its width
 _FEW = 6  # curves that one panel shows by default, each with its entry in the legend
-# Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
-# flatten motions that a thousandth of a hair's width is a lot for.
+# Share of the scale of its unit below which what a panel shows is rounding. Ten times
+# more would flatten motions that a thousandth of a hair's width is a lot for.
 _FLAT = 1e-9
 
 
@@ -34,7 +43,9 @@ def one_motion(motion: Motion) -> None:
     """Raise a ValueError for a batch, a TypeError for something else."""
     check_kind("motion", motion, Motion)
     if np.ndim(motion.status):
-        raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
+        raise ValueError(
+            "Argument `motion` must be one motion, but is a batch: pick one of it."
+        )
 
 
 @styled()
@@ -49,27 +60,30 @@ def motion(
 ) -> Figure:
     """Coordinates, velocities and gaps against time, events, and where the energy goes.
 
-    Each unit has axes of its own. Curves go through the states before and after every event, so
-    that a jump stands upright at its time. Of more than six curves a panel shows the six that move
-    most, of more than six contacts those with the most events; its legend says of how many. The
-    potential energy counts from its least value. What moves by rounding only is a flat line.
+    Each unit has axes of its own. Curves go through the states before and after every
+    event, so that a jump stands upright at its time. Of more than six curves a panel
+    shows the six that move most, of more than six contacts those with the most events;
+    its legend says of how many. The potential energy counts from its least value. What
+    moves by rounding only is a flat line.
 
     Args:
         motion: one motion (of a batch: `jax.tree.map(lambda x: x[i], motion)`).
         title: of the picture.
-        names: of the coordinates, with their units as in "x [m]"; default: those of the body.
-        system: that moved: its body names the coordinates, and its base is shown; without it and
-            without names they are q1, q2, ...
-        bodies: the ones to show, counted from 0, of a system whose coordinates are numbered by
-            body (x1, y1, ...).
-        contacts: the ones whose gaps to show, counted from 0; None: those of `bodies`, if the
-            system says which these are (`between` of `Bodies`).
+        names: of the coordinates, with their units as in "x [m]"; default: those of the
+            body.
+        system: that moved: its body names the coordinates, and its base is shown;
+            without it and without names they are q1, q2, ...
+        bodies: the ones to show, counted from 0, of a system whose coordinates are
+            numbered by body (x1, y1, ...).
+        contacts: the ones whose gaps to show, counted from 0; None: those of `bodies`,
+            if the system says which these are (`between` of `Bodies`).
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        ValueError: a batch of motions, or names of another number; no such body or contact.
+        ValueError: a batch of motions, or names of another number; no such body or
+            contact.
 
     >>> import jimpact as ji
     >>> ball = ji.System(ji.Column([1.0]), gravity=True)
@@ -82,38 +96,61 @@ def motion(
     course = course_of(motion)
     columns = [_by_unit(labels, bodies), _by_unit(rates, bodies)]
     rows = max(map(len, columns)) + 1
-    # left coordinates, right velocities, a row for each unit; in the last row gaps and energy
-    figure, panels = new_figure(2.7 * rows + 0.4, title, rows, 2, sharex=True, squeeze=False)
+    # left coordinates, right velocities, a row for each unit; in the last row gaps and
+    # energy
+    figure, panels = new_figure(
+        2.7 * rows + 0.4, title, rows, 2, sharex=True, squeeze=False
+    )
     scales = _scales(labels, motion)
-    for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
+    for j, (units, values) in enumerate(
+        zip(columns, (course.q, course.v), strict=True)
+    ):
         for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
-            count = len(which) if bodies is None else 0
+            if bodies is None:
+                count = len(which)
+            else:
+                count = 0
             if count > _FEW:
                 which = _largest(which, [_range(values[:, i]) for i, _ in which])
             at, words = zip(*which, strict=True)
             axes.plot(course.time, values[:, at], label=words)
             if j == 0 and unit == "m" and system is not None:
                 _draw_base(axes, system, motion)
-            what = words[0] if len(which) == 1 else ("coordinates", "velocities")[j]
+            if len(which) == 1:
+                what = words[0]
+            else:
+                what = ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
-            _finish_panel(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
+            _finish_panel(
+                axes,
+                scales.get(unit, 1.0),
+                f"{_FEW} of {count}" if count > _FEW else "",
+            )
         for axes in panels[len(units) : -1, j]:
             axes.remove()
-    note = _draw_gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
+    note = _draw_gaps(
+        panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts)
+    )
     _finish_panel(panels[-1, 0], scales["m"], note)
     _draw_energies(panels[-1, 1], motion, course, system)
-    _finish_panel(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
+    _finish_panel(
+        panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0
+    )
     for axes in figure.axes:
         if axes is not panels[-1, 1]:
             _draw_events(axes, motion)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
-    legend_below(figure, 4, [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)])
+    legend_below(
+        figure, 4, [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)]
+    )
     return figure
 
 
 def _finish_panel(axes: Axes, scale: float, note: str = "") -> None:
-    """Draw a panel's legend with a note, and set limits that do not enlarge rounding of `scale`."""
+    """Draw a panel's legend with a note, and set limits that do not enlarge rounding of
+    `scale`.
+    """
     axes.grid(False, axis="x")
     low, high = axes.dataLim.intervaly
     if high - low < _FLAT * scale:
@@ -121,13 +158,22 @@ def _finish_panel(axes: Axes, scale: float, note: str = "") -> None:
         axes.set_ylim(middle - scale / 2, middle + scale / 2)
     words = axes.get_legend_handles_labels()[1]
     if len(words) > 1:
-        above: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
-        columns = 2 if max(map(len, words)) > _LONG else 3
+        above: Any = {
+            "loc": "lower left",
+            "bbox_to_anchor": (0, 1),
+            "borderaxespad": 0.2,
+        }
+        if max(map(len, words)) > _LONG:
+            columns = 2
+        else:
+            columns = 3
         axes.legend(ncols=columns, title=note or None, frameon=False, **above)
 
 
 def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
-    """Largest sizes of coordinates and gaps by unit (1 for 0, and in rad); of rates over time."""
+    """Largest sizes of coordinates and gaps by unit (1 for 0, and in rad); of rates
+    over time.
+    """
     scales = {"m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
     sizes = np.nanmax(np.abs(motion.q), axis=0, initial=0.0).tolist()
     for label, size in zip(labels, sizes, strict=True):
@@ -150,15 +196,22 @@ def _shown_contacts(
     bodies: Sequence[int] | None,
     contacts: Sequence[int] | None,
 ) -> list[int] | None:
-    """Contacts (from 0) that were chosen, by number or by their bodies; None: no choice."""
+    """Contacts (from 0) that were chosen, by number or by their bodies; None: no
+    choice.
+    """
     count = motion.gaps.shape[1]
     if contacts is not None:
         for contact in contacts:
             if not 0 <= contact < count:
                 allowed = f"numbers in [0, {count - 1}]"
-                raise ValueError(f"Argument `contacts` must hold {allowed}, but holds {contact}.")
+                raise ValueError(
+                    f"Argument `contacts` must hold {allowed}, but holds {contact}."
+                )
         return list(contacts)
-    between = getattr(system.body, "between", None) if system is not None else None
+    if system is not None:
+        between = getattr(system.body, "between", None)
+    else:
+        between = None
     if bodies is None or between is None:
         return None
     return [j for j, pair in enumerate(between) if set(pair) & set(bodies)]
@@ -167,23 +220,30 @@ def _shown_contacts(
 def _labels(
     motion: Motion, names: Sequence[str], system: System | None
 ) -> tuple[list[str], list[str]]:
-    """Names, with units as in "x [m]", of the coordinates and of the velocities of a motion.
+    """Names, with units as in "x [m]", of the coordinates and of the velocities of a
+    motion.
 
     The given names, else those of the system's body, else q1, q2, ... and v1, v2, ...
     """
-    n, rates = motion.q.shape[-1], motion.velocity.shape[-1]
+    n = motion.q.shape[-1]
+    rates = motion.velocity.shape[-1]
     known = () if system is None else system.body.names
     labels = [*known, *(f"q{i + 1}" for i in range(len(known), n))]
     for i, name in enumerate(names[:n]):
         unit = split_name(labels[i])[1]
-        labels[i] = f"{name} [{unit}]" if unit and not split_name(name)[1] else name
+        if unit and not split_name(name)[1]:
+            labels[i] = f"{name} [{unit}]"
+        else:
+            labels[i] = name
     if n == rates:
         return labels, [rate_of(name) for name in labels]
     velocities = () if system is None else system.body.velocity_names
     return labels, [*velocities] or [f"v{i + 1}" for i in range(rates)]
 
 
-def _by_unit(names: list[str], bodies: Sequence[int] | None) -> dict[str, list[tuple[int, str]]]:
+def _by_unit(
+    names: list[str], bodies: Sequence[int] | None
+) -> dict[str, list[tuple[int, str]]]:
     """Names of coordinates grouped by unit, as (index, name without unit).
 
     Only those of `bodies` (from 0), the numbers at the end of x1, y1, ...; None: all.
@@ -194,7 +254,9 @@ def _by_unit(names: list[str], bodies: Sequence[int] | None) -> dict[str, list[t
     for body in bodies or ():
         if body not in owners:
             known = sorted({x for x in owners if x is not None})
-            raise ValueError(f"Argument `bodies` must hold some of {known}, but holds {body!r}.")
+            raise ValueError(
+                f"Argument `bodies` must hold some of {known}, but holds {body!r}."
+            )
     for i, name in enumerate(names):
         if bodies is None or owners[i] in bodies:
             word, unit = split_name(name)
@@ -203,7 +265,9 @@ def _by_unit(names: list[str], bodies: Sequence[int] | None) -> dict[str, list[t
 
 
 class _Course(NamedTuple):
-    """States in the order of time: the samples, and those before and after every event."""
+    """States in the order of time: the samples, and those before and after every
+    event.
+    """
 
     time: np.ndarray  # (S,) [s]
     q: np.ndarray  # (S, n)
@@ -212,8 +276,11 @@ class _Course(NamedTuple):
 
 
 def course_of(motion: Motion) -> _Course:
-    """States of a motion in the order of time: samples, and before and after each event."""
-    events, rows = motion.events, np.asarray(motion.events.kind) > 0
+    """States of a motion in the order of time: samples, and before and after each
+    event.
+    """
+    events = motion.events
+    rows = np.asarray(motion.events.kind) > 0
     # rows of the record that hold an event: its velocities before and after (E, 2, n)
     jumps = np.stack([events.velocity_before, events.velocity_after], axis=1)[rows]
     time = np.concatenate([motion.time, np.repeat(np.asarray(events.time)[rows], 2)])
@@ -223,17 +290,22 @@ def course_of(motion: Motion) -> _Course:
     after = np.arange(len(time)) - len(motion.time) + 1
     # stable: of events at one time before and after of the first, then of the second
     order = np.argsort(time, kind="stable")
-    return _Course(time[order], q[order], v[order], (after[order] > 0) & (after[order] % 2 == 0))
+    return _Course(
+        time[order], q[order], v[order], (after[order] > 0) & (after[order] % 2 == 0)
+    )
 
 
 def base_path(system: System, time: np.ndarray) -> np.ndarray:
-    """Displacement of the base (S, d) [m] at times (S,) [s], along directions of the body if any.
+    """Displacement of the base (S, d) [m] at times (S,) [s], along directions of the
+    body if any.
 
-    Along the body's directions B (columns) the components x solve `B x = D u` in least squares, u
-    the displacements along the base's own directions D.
+    Along the body's directions B (columns) the components x solve `B x = D u` in least
+    squares, u the displacements along the base's own directions D.
     """
-    assert system.base is not None
-    path = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(time)))  # type: ignore[misc]
+    base = system.base
+    assert base is not None
+    displacement = jax.vmap(lambda t: jnp.atleast_1d(base(t)))
+    path = np.asarray(displacement(jnp.asarray(time)))
     directions = system.body.base_directions
     if directions is None:
         return path
@@ -242,7 +314,9 @@ def base_path(system: System, time: np.ndarray) -> np.ndarray:
 
 
 def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
-    """Draw the displacement of the base over time, a line for each direction in which it moves."""
+    """Draw the displacement of the base over time, a line for each direction in which
+    it moves.
+    """
     if system.base is None:
         return
     reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
@@ -257,24 +331,34 @@ def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
 
 
 def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
-    """Draw the gaps over time, 0 at events of their contacts; a note says how many are shown.
+    """Draw the gaps over time, 0 at events of their contacts; a note says how many are
+    shown.
 
-    `shown` None: the `_FEW` contacts with the most events, then the least gaps, without those that
-    are always wider open than all that ever closed.
+    `shown` None: the `_FEW` contacts with the most events, then the least gaps, without
+    those that are always wider open than all that ever closed.
     """
-    values, events = np.asarray(motion.gaps), motion.events
+    values = np.asarray(motion.gaps)
+    events = motion.events
     # a gap for each contact; else only the least gap is known
     single = events.contacts.shape[-1] == values.shape[1]
-    closed = np.zeros((len(events.time), values.shape[1]), bool)  # contacts of each event
+    # contacts of each event
+    closed = np.zeros((len(events.time), values.shape[1]), bool)
     if single:
         closed = (np.asarray(events.kind) > 0)[:, None] & np.asarray(events.contacts)
     note = ""
     if shown is None:
-        ever, least = closed.any(axis=0), np.nanmin(values, axis=0, initial=np.inf)
-        far = np.nanmax(values[:, ever], initial=-np.inf) if ever.any() else np.inf
+        ever = closed.any(axis=0)
+        least = np.nanmin(values, axis=0, initial=np.inf)
+        if ever.any():
+            far = np.nanmax(values[:, ever], initial=-np.inf)
+        else:
+            far = np.inf
         near = list(np.flatnonzero(least <= far))
         shown = _largest(near, [(closed[:, j].sum(), -least[j]) for j in near])
-        note = f"{_FEW} of {values.shape[1]}" if len(near) > _FEW else ""
+        if len(near) > _FEW:
+            note = f"{_FEW} of {values.shape[1]}"
+        else:
+            note = ""
     for j in shown:
         rows = closed[:, j]
         time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
@@ -286,13 +370,17 @@ def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
 
 
 def _event_styles(motion: Motion) -> list[tuple[str, dict[str, Any]]]:
-    """Kinds of events to mark, with the style of their lines; impacts if there are few."""
+    """Kinds of events to mark, with the style of their lines; impacts if there are
+    few.
+    """
     styles: dict[str, dict[str, Any]] = {}
     if len(motion.event_times("impact")) <= _MANY:
         styles["impact"] = {"color": GREY, "lw": 0.4}
     for kind, style in zip(_MARKED, ("--", ":", "-."), strict=True):
         styles[kind] = {"color": "black", "lw": 0.8, "ls": style}
-    return [(kind, style) for kind, style in styles.items() if len(motion.event_times(kind))]
+    return [
+        (kind, style) for kind, style in styles.items() if len(motion.event_times(kind))
+    ]
 
 
 def _draw_events(axes: Axes, motion: Motion) -> None:
@@ -302,18 +390,24 @@ def _draw_events(axes: Axes, motion: Motion) -> None:
             axes.axvline(t, zorder=0, **style)
 
 
-def _draw_energies(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
+def _draw_energies(
+    axes: Axes, motion: Motion, course: _Course, system: System | None
+) -> None:
     """Draw energies [J] over time: T, T + V, and the work of contacts, base and forces.
 
-    V counts from its least value, so that losses can be seen. T and T + V of a known system jump at
-    events, else they are those of the samples.
+    V counts from its least value, so that losses can be seen. T and T + V of a known
+    system jump at events, else they are those of the samples.
     """
     time = np.asarray(motion.time)
     if system is None:
-        at, kinetic_energy, energy = time, motion.kinetic_energy, motion.energy
+        at = time
+        kinetic_energy = motion.kinetic_energy
+        energy = motion.energy
     else:
-        q, v = jnp.asarray(course.q), jnp.asarray(course.v)
-        at, kinetic_energy = course.time, jax.vmap(partial(kinetic, system))(q, v)
+        q = jnp.asarray(course.q)
+        v = jnp.asarray(course.v)
+        at = course.time
+        kinetic_energy = jax.vmap(partial(kinetic, system))(q, v)
         energy = kinetic_energy + jax.vmap(partial(potential, system))(q)
     least = np.nanmin(energy - kinetic_energy, initial=np.inf)
     axes.plot(at, energy - least, color="black", label="T + V − min V")
@@ -345,11 +439,13 @@ def phase_portrait(
 
     Args:
         motion: one motion.
-        coordinate: which, counted from 0; None: the one with the largest range times range of
+        coordinate: which, counted from 0; None: the one with the largest range times
+            range of
             its velocity, in SI units.
         title: of the picture.
         names: of the coordinates, as in `motion`.
-        system: that moved, as in `motion`; needed where velocities are not the rates of q.
+        system: that moved, as in `motion`; needed where velocities are not the rates of
+            q.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -359,7 +455,9 @@ def phase_portrait(
 
     >>> import jimpact as ji
     >>> dimer = ji.System(ji.Dimer(0.1, 1.0), gravity=True)
-    >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
+    >>> motion = ji.simulate(
+    ...     dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21
+    ... )
     >>> ji.plot.phase_portrait(motion, system=dimer).axes[0].get_xlabel()
     'angle [rad]'
     """
@@ -369,24 +467,42 @@ def phase_portrait(
     # coordinate -> its velocity
     pairs = {i: i for i in range(len(labels))}
     if len(labels) != len(rates):
-        pairs = {i: rates.index(x) for i, x in enumerate(map(rate_of, labels)) if x in rates}
+        pairs = {
+            i: rates.index(x) for i, x in enumerate(map(rate_of, labels)) if x in rates
+        }
     if not pairs:
-        raise ValueError("Argument `system` must be given where velocities are not rates of q.")
+        raise ValueError(
+            "Argument `system` must be given where velocities are not rates of q."
+        )
     if coordinate is None:
-        size = {i: _range(course.q[:, i]) * _range(course.v[:, j]) for i, j in pairs.items()}
+        size = {
+            i: _range(course.q[:, i]) * _range(course.v[:, j]) for i, j in pairs.items()
+        }
         coordinate = max(size, key=lambda i: size[i])
     if coordinate not in pairs:
         raise ValueError(
-            f"Argument `coordinate` must lie in [{min(pairs)}, {max(pairs)}], but is {coordinate}."
+            f"Argument `coordinate` must lie in [{min(pairs)}, {max(pairs)}], but is "
+            f"{coordinate}."
         )
     rate = pairs[coordinate]
     figure, axes = new_figure(5.0, title)
-    position, speed = course.q[:, coordinate], course.v[:, rate]
-    cut = np.flatnonzero(course.after)  # the line breaks between before and after an event
-    axes.plot(np.insert(position, cut, np.nan), np.insert(speed, cut, np.nan), color=COLOURS[0])
+    position = course.q[:, coordinate]
+    speed = course.v[:, rate]
+    # the line breaks between before and after an event
+    cut = np.flatnonzero(course.after)
+    axes.plot(
+        np.insert(position, cut, np.nan),
+        np.insert(speed, cut, np.nan),
+        color=COLOURS[0],
+    )
     jumps = np.stack([cut - 1, cut])
-    lines = axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
-    hint = "" if names or system is not None else "  (`system=` or `names=` name it)"
+    lines = axes.plot(
+        position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0
+    )
+    if names or system is not None:
+        hint = ""
+    else:
+        hint = "  (`system=` or `names=` name it)"
     axes.set(xlabel=labels[coordinate] + hint, ylabel=rates[rate])
     if lines:
         lines[0].set_label("jump at an event")
@@ -397,18 +513,22 @@ def phase_portrait(
 def _range(values: np.ndarray) -> float:
     """Range of the finite values, 0 without any."""
     finite = values[np.isfinite(values)]
-    return float(np.ptp(finite)) if len(finite) else 0.0
+    if len(finite):
+        return float(np.ptp(finite))
+    return 0.0
 
 
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """Draw a body at its configuration q, and the planes that it stands on."""
     point = POINT * (np.ptp(q) or 1.0)  # radius of a point mass [m]
-    curves, floors = body.outlines(q, point), [plane_of(*floor) for floor in body.floors]
+    curves = body.outlines(q, point)
+    floors = [plane_of(*floor) for floor in body.floors]
     set_limits(axes, [curves], np.zeros((1, 2)), floors)
     for points, colour in zip(curves, colours_of(body, q, point), strict=True):
         axes.plot(*points.T, color=colour)
     for angle, offset in body.floors:
-        foot = (-offset * np.sin(angle), offset * np.cos(angle))  # nearest to the origin
+        # nearest to the origin
+        foot = (-offset * np.sin(angle), offset * np.cos(angle))
         axes.axline(foot, slope=np.tan(angle), color=GREY, lw=2)
 
 
@@ -419,7 +539,9 @@ def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:
 
 
 def plane_of(angle: float, offset: float) -> tuple[np.ndarray, float]:
-    """Normal n (2,) and offset of the plane `n^T x = offset` inclined by `angle` [rad]."""
+    """Normal n (2,) and offset of the plane `n^T x = offset` inclined by `angle`
+    [rad].
+    """
     return np.array([-np.sin(angle), np.cos(angle)]), float(offset)
 
 
@@ -437,9 +559,11 @@ def set_limits(
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     feet = [middle - (n @ (middle - ground[0]) - offset) * n for n, offset in floors]
     points = np.concatenate([points, *(foot[None] for foot in feet)])
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     half = 0.55 * float((high - low).max()) or 1.0
     centre = (low + high) / 2
-    (left, bottom), (right, top) = centre - half, centre + half
+    left, bottom = centre - half
+    right, top = centre + half
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axes.locator_params(nbins=5)

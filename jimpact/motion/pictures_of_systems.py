@@ -20,15 +20,17 @@ _GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
 _LEAST = 0.35  # radius of a small body, likewise
 _ARROW = 2.2  # length of the fastest velocity, likewise
 _THICKEST = 8.0  # line of the largest impulse [points]; ten times more hides the bodies
-_FAINT = 1e-3  # impulses over the largest one that are not drawn; ten times more breaks chains
+# impulses over the largest one that are not drawn; ten times more breaks chains
+_FAINT = 1e-3
 
 
 @styled()
 def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     """A system as it is before an impact or a motion.
 
-    A chain is a row of circles, their areas about as the masses, with arrows for the velocities;
-    open contacts are drawn apart, not to scale. A body is drawn to scale, on what it stands on.
+    A chain is a row of circles, their areas about as the masses, with arrows for the
+    velocities; open contacts are drawn apart, not to scale. A body is drawn to scale,
+    on what it stands on.
 
     Args:
         drawn: a chain (`ji.chain`), a body such as `ji.Block`, or a `System` of one.
@@ -47,13 +49,20 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     """
     if isinstance(drawn, Scene):
         if drawn.walls is None:
-            raise TypeError("Argument `drawn` must be a chain, a body or a system; draw the body.")
+            raise TypeError(
+                "Argument `drawn` must be a chain, a body or a system; draw the body."
+            )
         figure, axes = new_figure(2.4, title)
         _draw_chain(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
-        body = drawn.body if isinstance(drawn, System) else drawn
+        if isinstance(drawn, System):
+            body = drawn.body
+        else:
+            body = drawn
         if body.names:
-            check_shape("state", state, (len(body.names),), "one per coordinate of the body")
+            check_shape(
+                "state", state, (len(body.names),), "one per coordinate of the body"
+            )
         check_values("state", state)
         figure, axes = new_figure(3.6, title)
         draw_body(axes, body, np.asarray(state, float))
@@ -62,8 +71,10 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
 
 
 @styled()
-def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
-    """The impulses in a packing as lines between the centres, as thick as they are large.
+def force_chains(
+    pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = ""
+) -> Figure:
+    """The impulses in a packing, lines between the centres as thick as they are large.
 
     Spheres are seen in projection; large impulses cover small ones.
 
@@ -78,8 +89,8 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: another body, or a scene that `closed_scene` did not make. ValueError: not one
-            impulse per contact.
+        TypeError: another body, or a scene that `closed_scene` did not make.
+            ValueError: not one impulse per contact.
 
     >>> import jimpact as ji
     >>> balls = ji.Bodies([ji.Sphere(0.1)] * 2, (), room=8)
@@ -89,7 +100,9 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     1
     """
     if not (isinstance(pile, Bodies) and pile.room):
-        raise TypeError(f"Argument `pile` must be `Bodies` with `room` (many), but is {pile!r}.")
+        raise TypeError(
+            f"Argument `pile` must be `Bodies` with `room` (many), but is {pile!r}."
+        )
     check_kind("scene", scene, Scene)
     if scene.pairs is None or scene.size != pile.mass.shape[0]:
         raise TypeError("Argument `scene` must be `pile.closed_scene(q)`.")
@@ -97,9 +110,12 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     check_shape("impulse", p, (scene.contacts,), "one per contact")
     d = pile.dimension
     centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
-    first, second = scene.pairs.neighbours.bodies.T  # bodies of each contact; second < 0: a wall
+    # bodies of each contact; second < 0: a wall
+    first, second = scene.pairs.neighbours.bodies.T
     ends = np.where(
-        (second < 0)[:, None], _points_on_walls(pile, scene.pairs, centres), centres[second]
+        (second < 0)[:, None],
+        _points_on_walls(pile, scene.pairs, centres),
+        centres[second],
     )
     size = np.abs(p) / (np.abs(p).max() or 1.0)
     drawn = np.flatnonzero(size > _FAINT)
@@ -108,24 +124,32 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
     lines = np.stack([centres[first], ends], axis=1)[drawn]
-    lines = lines if d == 2 else projected(lines)
+    if d != 2:
+        lines = projected(lines)
     widths = _THICKEST * size[drawn]
-    chains = LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
+    chains = LineCollection(
+        list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8
+    )
     axes.add_collection(chains)
     axes.autoscale_view()
     axes.set(xlabel="x [m]", ylabel="height [m]", aspect="equal")
     return figure
 
 
-def _points_on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
-    """Points (m, d) [m] at which bodies at `centres` touch walls, if their contact is with a wall.
+def _points_on_walls(
+    pile: Bodies, pairs: PairNormals, centres: np.ndarray
+) -> np.ndarray:
+    """Points (m, d) [m] at which bodies at `centres` touch walls, if their contact is
+    with a wall.
 
-    Equation: `x = c - (n^T c - offset) n`, the foot of the centre c on the wall that its normal n
-    is nearest to; in the plane moved along the wall by the lever, the part of the normal that turns
-    the body.
+    Equation: `x = c - (n^T c - offset) n`, the foot of the centre c on the wall that
+    its normal n is nearest to; in the plane moved along the wall by the lever, the part
+    of the normal that turns the body.
     """
-    d, walls = pile.dimension, np.asarray(pile.planes)
-    first, normal = pairs.neighbours.bodies[:, 0], np.asarray(pairs.directions)[:, 0]
+    d = pile.dimension
+    walls = np.asarray(pile.planes)
+    first = pairs.neighbours.bodies[:, 0]
+    normal = np.asarray(pairs.directions)[:, 0]
     n = normal[:, :d]
     if not len(walls):
         return centres[first]
@@ -138,16 +162,20 @@ def _points_on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> n
 
 
 def _draw_chain(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
-    """Draw a chain as a row of circles with their masses [kg], and arrows for velocities [m/s].
+    """Draw a chain as a row of circles with their masses [kg], and arrows for
+    velocities [m/s].
 
     Lengths are in radii of the largest body, `radius = sqrt(m / max m)`.
     """
     mass = np.asarray(scene.mass, float)
     radius = np.maximum((mass / mass.max()) ** 0.5, _LEAST)
     left, right = scene.walls or (False, False)
-    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)  # of each contact, walls included
+    # of each contact, walls included
+    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)
     # the gap to the left of each body
-    before = np.concatenate([apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]])
+    before = np.concatenate(
+        [apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]]
+    )
     centre = np.cumsum(before + np.concatenate([radius[:1], radius[:-1] + radius[1:]]))
     end = centre[-1] + radius[-1]
     fastest = np.abs(velocity).max() or 1.0

@@ -15,7 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jimpact.tools.records import as_data, fields_as_data
 from jimpact.tools.status import STATUS, Status
 
-EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
+EVENT_KINDS = (
+    "none",
+    "impact",
+    "accumulation",
+    "contact",
+    "detachment",
+    "friction",
+    "paroxysm",
+)
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not printed
 FORMAT = 1  # version of the files of motions
 
@@ -29,18 +37,19 @@ _NAMES = {
 }
 
 
-AnyArray = Array | np.ndarray  # on the host `Motion.then` and `joined` take rows by NumPy
+# on the host `Motion.then` and `joined` take rows by NumPy
+AnyArray = Array | np.ndarray
 
 
 class Events(eqx.Module):
     """Rows of events, in time; rows beyond `count` are NaN or 0. E: number of rows.
 
-    `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the impact at
-    which the rest of an infinite sequence is passed; by estimates from its energy, the force that
-    presses and what the impact took, `accumulation_end` [s] is when that sequence would end, and
-    `accumulation_gap` [m] how far its contacts might still have opened. A `paroxysm` is an impact
-    without collision. `energy` (2, m) is what each contact gave (< 0: took), normally and
-    tangentially.
+    `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the
+    impact at which the rest of an infinite sequence is passed; by estimates from its
+    energy, the force that presses and what the impact took, `accumulation_end` [s] is
+    when that sequence would end, and `accumulation_gap` [m] how far its contacts might
+    still have opened. A `paroxysm` is an impact without collision. `energy` (2, m) is
+    what each contact gave (< 0: took), normally and tangentially.
     """
 
     count: Int[AnyArray, "..."]
@@ -58,9 +67,14 @@ class Events(eqx.Module):
     accumulation_gap: Float[AnyArray, "... E"]
 
 
-def no_events(size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | None = None) -> Events:
-    """Table of `size` empty rows for events of m contacts; `tangents`: their number, None: m."""
-    dtype, n = q.dtype, v.shape[0]
+def no_events(
+    size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | None = None
+) -> Events:
+    """Table of `size` empty rows for events of m contacts; `tangents`: their number,
+    None: m.
+    """
+    dtype = q.dtype
+    n = v.shape[0]
 
     def blank(*shape: int) -> Float[Array, "size ..."]:
         """NaN for each row, of this shape."""
@@ -84,17 +98,28 @@ def no_events(size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | Non
 
 
 def joined(parts: list[Events], most: int) -> Events:
-    """Events of runs that follow each other as one table, on the host; `most` rows at most."""
+    """Events of runs that follow each other as one table, on the host; `most` rows at
+    most.
+    """
     if len(parts) == 1 and len(parts[0].time) <= most:
         return parts[0]
     columns = [name for name in Events.__dataclass_fields__ if name != "count"]
-    rows = {name: np.concatenate([getattr(x, name) for x in parts])[:most] for name in columns}
+    rows = {
+        name: np.concatenate([getattr(x, name) for x in parts])[:most]
+        for name in columns
+    }
     count = np.sum([x.count for x in parts], dtype=np.int32)
-    return Events(jnp.asarray(count), **{name: jnp.asarray(x) for name, x in rows.items()})
+    return Events(
+        jnp.asarray(count), **{name: jnp.asarray(x) for name, x in rows.items()}
+    )
 
 
-def with_row(events: Events, happened: Bool[Array, ""], values: dict[str, jax.Array]) -> Events:
-    """Events with the `values` of fields in the next row if one `happened` and a row is left."""
+def with_row(
+    events: Events, happened: Bool[Array, ""], values: dict[str, jax.Array]
+) -> Events:
+    """Events with the `values` of fields in the next row if one `happened` and a row is
+    left.
+    """
     size = events.time.shape[0]
     row = jnp.where(happened, events.count, size)
     new = {
@@ -109,7 +134,8 @@ class Motion(eqx.Module):
     """A motion, or a batch B of them: samples at equal times, events, energies, status.
 
     Samples that were not reached are NaN. The ledger
-    `T + V - (T + V)(t_0) = force_work + base_work + sum contact_work` holds at every sample.
+    `T + V - (T + V)(t_0) = force_work + base_work + sum contact_work` holds at every
+    sample.
 
     Attributes:
         time: (S,) [s].
@@ -119,7 +145,8 @@ class Motion(eqx.Module):
         potential_energy: V (S,) [J].
         force_work: of `force` since the start (S,) [J].
         base_work: of the moving base (S,) [J].
-        contact_work: of each contact, normal and tangential (S, 2, m) [J]; <= 0 dissipates.
+        contact_work: of each contact, normal and tangential (S, 2, m) [J]; <= 0
+            dissipates.
         gaps: (S, m) [m].
         events: a table of all impacts, liftoffs, .., as `print(motion)` lists them.
         steps: () of the integrator.
@@ -133,7 +160,8 @@ class Motion(eqx.Module):
     potential_energy: Float[Array, "... S"]
     force_work: Float[Array, "... S"]
     base_work: Float[Array, "... S"]
-    contact_work: Float[Array, "... S 2 M"]  # normal, tangential; of a pile M = 1, else m
+    # normal, tangential; of a pile M = 1, else m
+    contact_work: Float[Array, "... S 2 M"]
     gaps: Float[Array, "... S M"]
     events: Events
     steps: Int[Array, "..."]
@@ -147,19 +175,27 @@ class Motion(eqx.Module):
     @property
     def ledger_residual(self) -> Float[Array, "... S"]:
         """Error of the ledger [J]: `T + V - (T + V)(t_0)` without all works."""
-        work = self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
+        work = (
+            self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
+        )
         return self.energy - self.energy[..., :1] - work
 
     def event_times(self, kind: str = "impact") -> np.ndarray:
         """Times of the events of a kind, on the host, of one motion."""
         if kind not in EVENT_KINDS:
-            raise ValueError(f"Argument `kind` must be one of {EVENT_KINDS}, but is {kind!r}.")
-        return np.asarray(self.events.time)[np.asarray(self.events.kind) == KIND_CODE[kind]]
+            raise ValueError(
+                f"Argument `kind` must be one of {EVENT_KINDS}, but is {kind!r}."
+            )
+        return np.asarray(self.events.time)[
+            np.asarray(self.events.kind) == KIND_CODE[kind]
+        ]
 
     def restart(self, t_end: float) -> dict[str, Any]:
-        """Arguments `q0`, `v0`, `t_end` of `simulate` with which one motion goes on, on the host.
+        """Arguments `q0`, `v0`, `t_end` of `simulate` with which one motion goes on, on
+        the host.
 
-        `simulate(system, law, **motion.restart(2.0))` begins at the last sample that was reached.
+        `simulate(system, law, **motion.restart(2.0))` begins at the last sample that
+        was reached.
         """
         last = self._reached() - 1
         times = (float(self.time[last]), t_end)
@@ -168,35 +204,53 @@ class Motion(eqx.Module):
     def _reached(self) -> int:
         """Number of samples that were reached, of one motion."""
         if np.ndim(self.status):
-            raise ValueError("A batch of motions has no common end: pick one motion of it.")
+            raise ValueError(
+                "A batch of motions has no common end: pick one motion of it."
+            )
         return int(np.isfinite(np.asarray(self.q)).all(axis=-1).sum())
 
     def then(self, later: "Motion") -> "Motion":
-        """This motion and a `later` one, which goes on from its end (`restart`), as one record.
+        """This motion and a `later` one, which goes on from its end (`restart`), as one
+        record.
 
         Works add up, so that the ledger holds from the start of this motion on.
         """
         count = self._reached()
-        last, begin = float(self.time[count - 1]), float(later.time[0])
+        last = float(self.time[count - 1])
+        begin = float(later.time[0])
         if begin != last:
             raise ValueError(
-                f"Argument `later` must begin at {last:g} s, where this motion ends, but begins at "
+                f"Argument `later` must begin at {last:g} s, where this motion ends, "
+                f"but begins at "
                 f"{begin:g} s."
             )
         samples = {}
         for name in _SAMPLED:
-            first, second = getattr(self, name)[:count], getattr(later, name)[1:]
-            added = first[-1] if name.endswith("_work") else 0.0
+            first = getattr(self, name)[:count]
+            second = getattr(later, name)[1:]
+            if name.endswith("_work"):
+                added = first[-1]
+            else:
+                added = 0.0
             samples[name] = jnp.concatenate([first, second + added])
         # events after the last sample occur in `later` again
-        known = np.asarray(self.events.kind > 0) & (np.asarray(self.events.time) <= last)
-        events = jax.tree.map(lambda x: np.asarray(x)[known] if np.ndim(x) else x, self.events)
+        known = np.asarray(self.events.kind > 0) & (
+            np.asarray(self.events.time) <= last
+        )
+        events = jax.tree.map(
+            lambda x: np.asarray(x)[known] if np.ndim(x) else x, self.events
+        )
         events = dataclasses.replace(events, count=jnp.int32(known.sum()))
-        table = joined([events, later.events], int(known.sum()) + later.events.time.shape[0])
-        return dataclasses.replace(later, **samples, events=table, steps=self.steps + later.steps)
+        table = joined(
+            [events, later.events], int(known.sum()) + later.events.time.shape[0]
+        )
+        return dataclasses.replace(
+            later, **samples, events=table, steps=self.steps + later.steps
+        )
 
     def explain_failure(self, row: Status, lanes: np.ndarray) -> str:
-        """End of a message: names of the law's status codes in the failed motions `lanes`.
+        """End of a message: names of the law's status codes in the failed motions
+        `lanes`.
 
         Empty unless their status, of which `row` is the table's row, is `law_failed`.
         """
@@ -204,7 +258,9 @@ class Motion(eqx.Module):
             return ""
         codes = np.asarray(self.events.status).reshape(self.status.size, -1)[lanes]
         names = [STATUS[code].name for code in np.unique(codes.max(axis=1)) if code]
-        return f": {', '.join(names)}" if names else ""
+        if names:
+            return f": {', '.join(names)}"
+        return ""
 
     def save(self, path: str | Path) -> Path:
         """Write everything to `path`, which ends in .npz; `ji.load` reads it."""
@@ -212,7 +268,10 @@ class Motion(eqx.Module):
         if path.suffix != ".npz":
             raise ValueError(f"Argument `path` must end in .npz, but is '{path}'.")
         arrays = {name: np.asarray(x) for name, x in _arrays(self).items()}
-        arrays |= {"format": np.asarray(FORMAT), "jimpact": np.asarray(version("jimpact"))}
+        arrays |= {
+            "format": np.asarray(FORMAT),
+            "jimpact": np.asarray(version("jimpact")),
+        }
         for name, words in _NAMES.items():
             arrays[name] = np.asarray(words)[arrays[name]]
         with path.open("wb") as file:
@@ -220,20 +279,32 @@ class Motion(eqx.Module):
         return path
 
     def to_dict(self) -> dict[str, Any]:
-        """Samples, events by the names of their kinds, and status, ready for JSON (NaN: None)."""
+        """Samples, events by the names of their kinds, and status, ready for JSON (NaN:
+        None).
+        """
         n = int(self.events.count)
-        rows = {k: np.asarray(v)[:n] for k, v in vars(self.events).items() if k != "count"}
+        rows = {
+            k: np.asarray(v)[:n] for k, v in vars(self.events).items() if k != "count"
+        }
         events = rows | {"kind": [EVENT_KINDS[k] for k in rows["kind"]]}
         status = STATUS[int(self.status)].name
-        return fields_as_data(self, "events") | as_data({"status": status, "events": events})
+        return fields_as_data(self, "events") | as_data(
+            {"status": status, "events": events}
+        )
 
     def __str__(self) -> str:
-        """Status, events and energies in five lines; of a batch how many have which status."""
+        """Status, events and energies in five lines; of a batch how many have which
+        status.
+        """
         if np.ndim(self.status):
             return _batch_report(self)
         kinds = np.asarray(self.events.kind)
         numbers = np.bincount(kinds, minlength=len(EVENT_KINDS))
-        counts = [f"{n} {name}" for n, name in zip(numbers, EVENT_KINDS) if n and name != "none"]
+        counts = [
+            f"{n} {name}"
+            for n, name in zip(numbers, EVENT_KINDS)
+            if n and name != "none"
+        ]
         row = STATUS[int(self.status)]
         reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
         last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
@@ -245,13 +316,20 @@ class Motion(eqx.Module):
             "forces": self.force_work[last],
         }
         lines = [
-            f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
+            (
+                f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: "
+                f"{row.name}"
+            )
             + (f" ({row.message})" if row.name != "ok" else ""),
             f"  events: {', '.join(counts) or 'none'}",
-            f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
+            f"  energy T + V: {float(self.energy[0]):.6g} J to "
+            f"{float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",
             f"  {_work_report(works)}",
-            f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
+            (
+                f"  ledger closes to "
+                f"{np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J"
+            ),
         ]
         return "\n".join(lines)
 
@@ -267,7 +345,9 @@ def _arrays(motion: Motion) -> dict[str, jax.Array]:
 
 
 def read_motion(path: Path) -> Motion:
-    """Read a motion, or batch, that `Motion.save` wrote; a ValueError says what else a file is."""
+    """Read a motion, or batch, that `Motion.save` wrote; a ValueError says what else a
+    file is.
+    """
     wrong = f"Argument `path` must be a file of `Motion.save`, but '{path}' "
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -280,7 +360,8 @@ def read_motion(path: Path) -> Motion:
     written = arrays.pop("jimpact")
     if int(found) != FORMAT:
         raise ValueError(
-            f"{wrong}has format {int(found)}, of jimpact {written}; this version reads {FORMAT}."
+            f"{wrong}has format {int(found)}, of jimpact {written}; this version reads "
+            f"{FORMAT}."
         )
     for name, words in _NAMES.items():
         arrays[name] = np.vectorize(words.index, otypes=[np.int32])(arrays[name])
@@ -292,7 +373,9 @@ def read_motion(path: Path) -> Motion:
 
 
 def _work_report(works: dict[str, Any]) -> str:
-    """Sentence of the works [J] by source, `gave` > 0 and `took` < 0; roundings are left out."""
+    """Sentence of the works [J] by source, `gave` > 0 and `took` < 0; roundings are
+    left out.
+    """
     least = _ROUNDING * max(abs(float(work)) for work in works.values())
     parts = [
         f"{source} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
@@ -305,5 +388,7 @@ def _work_report(works: dict[str, Any]) -> str:
 def _batch_report(motion: Motion) -> str:
     """Line with the number of motions of a batch, and how many have each status."""
     codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
-    parts = ", ".join(f"{n} {STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
+    parts = ", ".join(
+        f"{n} {STATUS[c].name}" for c, n in zip(codes, counts, strict=True)
+    )
     return f"{np.size(motion.status)} motions: {parts}"

@@ -1,4 +1,6 @@
-"""The loop of every motion in flights, by events and by contact forces: when it ends, and how."""
+"""The loop of every motion in flights, by events and by contact forces: when it ends,
+and how.
+"""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -21,14 +23,17 @@ from jimpact.motion.tables import (
 )
 from jimpact.tools.status import CODE
 
-# M is singular where its scaled least eigenvalue is below this share of that at the start
+# M is singular where its scaled least eigenvalue is below this share of that at the
+# start
 _SINGULAR = 1e-6
 AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
 
 
 @runtime_checkable
 class MotionRun(Protocol):
-    """A motion up to now; by events and by contact forces it remembers other things besides."""
+    """A motion up to now; by events and by contact forces it remembers other things
+    besides.
+    """
 
     @property
     def flight(self) -> Flight:
@@ -60,21 +65,26 @@ def end_of(
     smooth: Int[Array, "2"],
     more: Float[Array, " size"] | None = None,
 ) -> MotionEnd:
-    """End of a run: its table and counts, and its status, `why_stuck` where steps vanished.
+    """End of a run: its table and counts, and its status, `why_stuck` where steps
+    vanished.
 
-    `smooth`: numbers of samples and events before a normal jumped; `more`: see `MotionEnd`.
+    `smooth`: numbers of samples and events before a normal jumped; `more`: see
+    `MotionEnd`.
     """
     flight = run.flight
     stuck = flight.stuck & (run.status == CODE["ok"])
     why = why_stuck(problem.system, flight, problem.q0, problem.times)
     status = jnp.where(stuck, why, run.status).astype(jnp.int32)
-    return MotionEnd(run.table, flight.sample, run.event_count, flight.steps, status, smooth, more)
+    return MotionEnd(
+        run.table, flight.sample, run.event_count, flight.steps, status, smooth, more
+    )
 
 
 def course_of(
     problem: MotionProblem, start: State, run: Callable[[MotionProblem], MotionEnd]
 ) -> tuple[Course, Float[Array, " size"] | None]:
-    """Samples, events and status of `run(problem)`, with both derivatives; and `MotionEnd.more`.
+    """Samples, events and status of `run(problem)`, with both derivatives; and
+    `MotionEnd.more`.
 
     `start`: the state at the beginning, for the shapes of samples.
     """
@@ -89,14 +99,16 @@ def why_stuck(
 ) -> Int[Array, ""]:
     """Status code of a motion whose steps vanish or are too many.
 
-    `not_finite` or `out_of_range` a little AHEAD of its state, `singular_mass` where the least
-    eigenvalue of M, scaled by the diagonal at the start, has fallen below _SINGULAR; else
-    `max_steps`.
+    `not_finite` or `out_of_range` a little AHEAD of its state, `singular_mass` where
+    the least eigenvalue of M, scaled by the diagonal at the start, has fallen below
+    _SINGULAR; else `max_steps`.
     """
     state, q0, times = jax.lax.stop_gradient((flight.state, q0, times))
-    # where steps vanish before something that is not a number, it is a few roundings ahead
+    # where steps vanish before something that is not a number, it is a few roundings
+    # ahead
     ahead = AHEAD * (times[-1] - times[0])
-    q, t = system.body.moved(state.q, ahead * state.v), state.t + ahead
+    q = system.body.moved(state.q, ahead * state.v)
+    t = state.t + ahead
     force = user_force(system, q, state.v, t)
     rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
     parts = (state.q, state.v, rates, gaps(system, q, t))

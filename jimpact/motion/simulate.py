@@ -43,7 +43,8 @@ from jimpact.tools.progress import progress_bar, waiting
 from jimpact.tools.status import CODE
 
 CHUNK = 500  # events of one run of the program; more take memory in short motions
-MOST_EVENTS = 100_000  # default `max_events` on the host; more only delays the status `max_events`
+# default `max_events` on the host; more only delays the status `max_events`
+MOST_EVENTS = 100_000
 
 
 @full_precision
@@ -61,74 +62,100 @@ def simulate(
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
-    Equation: between impacts that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
-    are closed and at rest; f are the gaps, lambda_n the normal contact forces. At an impact `v+` of
-    `ji.impact` in the frame of the base. If friction admits no solution (Painleve paradox), a
-    tangential impact stops the slip, provided that the law supports it.
+    Equation: between impacts that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at
+    contacts that are closed and at rest; f are the gaps, lambda_n the normal contact
+    forces. At an impact `v+` of `ji.impact` in the frame of the base. If friction
+    admits no solution (Painleve paradox), a tangential impact stops the slip, provided
+    that the law supports it.
 
     Args:
-        system: gaps, mass, forces, base; its `friction` is that of persistent contacts, or else
-            the law's.
+        system: gaps, mass, forces, base; its `friction` is that of persistent contacts,
+            or else the law's.
         law: any impact law.
         q0: (n,) [m, rad] at the start, without penetration.
         v0: (n,) [m/s, rad/s] at the start; of bodies in space `(x', omega)`.
-        t_end: [s] > 0; or the pair of times (t_start, t_end) of a motion that does not begin at 0.
+        t_end: [s] > 0; or the pair of times (t_start, t_end) of a motion that does not
+            begin at 0.
         samples: number of equally spaced instants in the record, both ends included.
-        method: 'events' (flights that land on each event), 'contact_forces' (the forces of a
-            `Compliant` law act throughout: contacts take time, and may start in penetration), or
-            'time_stepping' (Moreau-Jean, for many contacts; needs `step`). With tolerances and
-            other options of its own: `EventDriven`, `ContactForces`, `TimeStepping`.
+        method: 'events' (flights that land on each event), 'contact_forces' (the forces
+            of a `Compliant` law act throughout: contacts take time, and may start in
+            penetration), or 'time_stepping' (Moreau-Jean, for many contacts; needs
+            `step`). With tolerances and other options of its own: `EventDriven`,
+            `ContactForces`, `TimeStepping`.
         step: of method 'time_stepping' [s].
-        max_events: largest number of recorded events; the next one ends the motion with status
-            `max_events` (time stepping goes on without recording). None: 500; for a direct call
-            with method 'events' (outside jit, vmap, derivatives) 100 000, computed in runs of 500.
+        max_events: largest number of recorded events; the next one ends the motion with
+            status `max_events` (time stepping goes on without recording). None: 500;
+            for a direct call with method 'events' (outside jit, vmap, derivatives) 100
+            000, computed in runs of 500.
 
     Returns:
-        `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
-        Methods 'events' and 'contact_forces' have derivatives in both modes (grad, jvp, hessian)
-        of everything in it, event times and accumulated works included, in all arrays, also those
-        captured by the system's functions. They hold for the order of events that occurs:
-        one-sided where two events change places or a contact is grazed; NaN of what a motion does
-        not reach.
+        `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its
+            status.
+        Methods 'events' and 'contact_forces' have derivatives in both modes (grad, jvp,
+        hessian) of everything in it, event times and accumulated works included, in all
+        arrays, also those captured by the system's functions. They hold for the order
+        of events that occurs: one-sided where two events change places or a contact is
+        grazed; NaN of what a motion does not reach.
 
     Raises:
-        NotImplementedError: derivatives of time stepping, which do not converge with the step.
-        ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
-            host; inside jit the status reports them (`raise_on_failure`).
+        NotImplementedError: derivatives of time stepping, which do not converge with
+            the step.
+        ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass,
+            on the host; inside jit the status reports them (`raise_on_failure`).
 
     >>> import jimpact as ji
     >>> ball = ji.System(ji.Column([1.0]), gravity=True)
     >>> motion = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
     >>> [round(float(t), 6) for t in motion.event_times()[:3]]
     [0.451601, 1.174162, 1.752211]
-    >>> [round(float(t), 6) for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]]
+    >>> [
+    ...     round(float(t), 6)
+    ...     for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]
+    ... ]
     [4.064407]
     """
     check_kind("system", system, System)
     check_kind("law", law, Law)
-    q, v = as_float_array("q0", q0), as_float_array("v0", v0)
+    q = as_float_array("q0", q0)
+    v = as_float_array("v0", v0)
     system, law, q, v = in_common_dtype(system, law, q, v)
     method = as_method(method, step)
     start = start_by(method, system, law, q, v, t_end)
     count = as_whole("samples", samples, 2)
-    rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
+    if max_events is None:
+        rows = CHUNK
+    else:
+        rows = as_whole("max_events", max_events, 1)
     arguments: Any
     if isinstance(method, TimeStepping):
         substeps = substeps_of(method, *as_times(t_end), count)
         joint = law.joins_step and system.friction is None
         check_stepped_law(system, law, start.contacts, joint)
-        return _waited(_stepped, (start, law, substeps, count, joint, rows), method.progress)
-    slow = SLOW if isinstance(method, ContactForces) else method.slow
+        return _waited(
+            _stepped, (start, law, substeps, count, joint, rows), method.progress
+        )
+    if isinstance(method, ContactForces):
+        slow = SLOW
+    else:
+        slow = method.slow
     settings = Settings(
-        *tolerances(method, q.dtype), start.closed_below, start.gap_rounding, method.max_steps,
-        start.friction is not None, start.in_space, start.end - start.time,
+        *tolerances(method, q.dtype),
+        start.closed_below,
+        start.gap_rounding,
+        method.max_steps,
+        start.friction is not None,
+        start.in_space,
+        start.end - start.time,
         jnp.asarray(slow, q.dtype),
-    )  # fmt: skip
+    )
     if isinstance(method, ContactForces):
         arguments = start, force_of(law), settings, count, rows, method.until_apart
         return _waited(_forced, arguments, method.progress)
     if _on_host((start, law, settings)):
-        most = MOST_EVENTS if max_events is None else max_events
+        if max_events is None:
+            most = MOST_EVENTS
+        else:
+            most = max_events
         return _in_runs(start, law, settings, count, most, method.progress)
     return _events(start, law, settings, None, count, rows)[0]
 
@@ -138,7 +165,9 @@ def _on_host(arguments: Any) -> bool:
     return not is_traced(arguments) and is_top_level_call()
 
 
-def _waited(run: Callable[..., Motion], arguments: Any, progress: float | None) -> Motion:
+def _waited(
+    run: Callable[..., Motion], arguments: Any, progress: float | None
+) -> Motion:
     """The motion by one program, with a message on stderr while it runs on the host."""
     if not _on_host(arguments):
         return run(*arguments)
@@ -147,7 +176,12 @@ def _waited(run: Callable[..., Motion], arguments: Any, progress: float | None) 
 
 
 def _in_runs(
-    start: Start, law: Law, settings: Settings, samples: int, most: int, progress: float | None
+    start: Start,
+    law: Law,
+    settings: Settings,
+    samples: int,
+    most: int,
+    progress: float | None,
 ) -> Motion:
     """Motion in runs of `CHUNK` events, each of which goes on where the last one ended.
 
@@ -160,7 +194,9 @@ def _in_runs(
         show("motion", 0.0, duration)
         while True:
             left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
-            motion, numbers = _events(start, law, settings, Past(left, numbers), samples, CHUNK)
+            motion, numbers = _events(
+                start, law, settings, Past(left, numbers), samples, CHUNK
+            )
             parts.append(motion.events)
             if int(motion.status) != CODE["max_events"] or CHUNK * len(parts) >= most:
                 return dataclasses.replace(motion, events=joined(parts, most))
@@ -199,7 +235,12 @@ def _forced(
 
 @quick_jit
 def _stepped(
-    start: Start, law: Law, substeps: Int[Array, ""], samples: int, joint: bool, max_events: int
+    start: Start,
+    law: Law,
+    substeps: Int[Array, ""],
+    samples: int,
+    joint: bool,
+    max_events: int,
 ) -> Motion:
     """Motion by time stepping, `substeps` between two samples."""
     times = _equal_times(start, samples)
@@ -208,12 +249,19 @@ def _stepped(
 
 
 def _problem(
-    start: Start, law: Law | Force, settings: Settings, samples: int, past: Past | None = None
+    start: Start,
+    law: Law | Force,
+    settings: Settings,
+    samples: int,
+    past: Past | None = None,
 ) -> MotionProblem:
     """Data of a motion in flights, sampled at equally spaced instants."""
     times = _equal_times(start, samples)
-    system, mu = start.system, start.friction
-    return MotionProblem(system, law, mu, settings, start.q, start.v, times, start.contacts, past)
+    system = start.system
+    mu = start.friction
+    return MotionProblem(
+        system, law, mu, settings, start.q, start.v, times, start.contacts, past
+    )
 
 
 def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Motion:
@@ -227,7 +275,8 @@ def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Moti
     ) -> Float[Array, "S ..."]:
         """Values of a function at all samples, NaN where they were not reached.
 
-        There it is evaluated at the first sample, so that no NaN reaches derivatives of others.
+        There it is evaluated at the first sample, so that no NaN reaches derivatives of
+        others.
         """
 
         def by_sample(values: Shaped[Array, " S"], ndim: int) -> Shaped[Array, "S ..."]:
@@ -237,7 +286,9 @@ def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Moti
         rows = (jnp.where(by_sample(reached, x.ndim), x, x[:1]) for x in args)
         values = over(function)(*rows)
         # times that were not reached are NaN, and so are their derivatives
-        return jnp.where(by_sample(reached, values.ndim), values, by_sample(at.t, values.ndim))
+        return jnp.where(
+            by_sample(reached, values.ndim), values, by_sample(at.t, values.ndim)
+        )
 
     return Motion(
         time=times,
@@ -256,7 +307,9 @@ def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Moti
 
 
 def _one_by_one(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
-    """The function over rows, as `jax.vmap`, but in turn: a branch not taken costs nothing."""
+    """The function over rows, as `jax.vmap`, but in turn: a branch not taken costs
+    nothing.
+    """
     return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
 
 

@@ -1,24 +1,27 @@
 """Directions of slip of contacts in space; each step has tangents of its own.
 
-The friction of a contact that slides is `-mu lambda_n u / |u|`: smooth but where slip ends or
-begins. At the beginning of a step the tangents of each contact are therefore turned: d is along its
-slip u_0, n at right angles to it.
+The friction of a contact that slides is `-mu lambda_n u / |u|`: smooth but where slip
+ends or begins. At the beginning of a step the tangents of each contact are therefore
+turned: d is along its slip u_0, n at right angles to it.
 
-SLIP ENDS where `u . d` falls to 0, which a step lands on. The field has to go on behind it, so the
-direction is that of `max(|u . d|, AHEAD |u_0|) d + (u . n) n`. Slip that ends without turning is
-then as smooth as in the plane.
+SLIP ENDS where `u . d` falls to 0, which a step lands on. The field has to go on behind
+it, so the direction is that of `max(|u . d|, AHEAD |u_0|) d + (u . n) n`. Slip that
+ends without turning is then as smooth as in the plane.
 
-ERRORS of slip count by what is left of it: a small error of a small slip is a large one of its
-direction, and of all derivatives. So steps integrate `ln |u|`, too, whose error limits their
-length: each takes a part of the slip, until less than LAST is left for the landing. This keeps its
-direction, as a constant: the time until it ends then has the derivatives of the slip that turns.
+ERRORS of slip count by what is left of it: a small error of a small slip is a large one
+of its direction, and of all derivatives. So steps integrate `ln |u|`, too, whose error
+limits their length: each takes a part of the slip, until less than LAST is left for the
+landing. This keeps its direction, as a constant: the time until it ends then has the
+derivatives of the slip that turns.
 
-SLIP BEGINS, at a contact that stuck, slowly: its rate r' grows from 0, while its direction follows
-the forces at a rate c / r, with c the acceleration by friction. As long as `r' < BEGINNING c` the
-contact therefore slides along its first direction, and is held across it. The force for this is
-too long by the square of the turn, and velocities err by BEGINNING^3 / 6 of `c^2 / c'`.
+SLIP BEGINS, at a contact that stuck, slowly: its rate r' grows from 0, while its
+direction follows the forces at a rate c / r, with c the acceleration by friction. As
+long as `r' < BEGINNING c` the contact therefore slides along its first direction, and
+is held across it. The force for this is too long by the square of the turn, and
+velocities err by BEGINNING^3 / 6 of `c^2 / c'`.
 
-THE FIRST DIRECTION of slip, from u = 0, is that of u', which depends on it: `n . u' = 0`.
+THE FIRST DIRECTION of slip, from u = 0, is that of u', which depends on it:
+`n . u' = 0`.
 """
 
 from typing import NamedTuple
@@ -40,27 +43,32 @@ from jimpact.motion.persistent_contact import (
 from jimpact.numerics.dense import solve_by_pivots
 from jimpact.tools.loops import any_lane
 
-# Least part of the slip at the beginning of a step that lies ahead within it. Ten times more, and
-# what a landing leaves of slip that turns is ten times as large.
+# Least part of the slip at the beginning of a step that lies ahead within it. Ten times
+# more, and what a landing leaves of slip that turns is ten times as large.
 AHEAD = 1e-2
-# Of the speed scale of the motion: less slip is none yet. Ten times more is still rounding.
+# Of the speed scale of the motion: less slip is none yet. Ten times more is still
+# rounding.
 NO_SLIP = 1e-13
-# Of the speed scale of the motion: slip that starts keeps its first direction as long as it is
-# less: friction turns it within less time than a step. Ten times more: it turns ten times later; a
-# thousandth: an error of the first step in its direction ends it again.
+# Of the speed scale of the motion: slip that starts keeps its first direction as long
+# as it is less: friction turns it within less time than a step. Ten times more: it
+# turns ten times later; a thousandth: an error of the first step in its direction ends
+# it again.
 FIRST = 1e-9
-# Of the speed scale of the motion: slip that is left for the landing. Ten times more: derivatives
-# of motions err by ten times as much where slip ends, ten times less: by rounding.
+# Of the speed scale of the motion: slip that is left for the landing. Ten times more:
+# derivatives of motions err by ten times as much where slip ends, ten times less: by
+# rounding.
 LAST = 1e-8
-# Error of `ln |u|` that a step may make, as a share of the speed scale over the slip, in tolerances
-# of the flight, and at most. Ten times more: derivatives err by ten times as much.
-TURNING, MOST_TURNING = 10.0, 1e-3
-# Iterations for first directions: 1 for one contact, 3 to 4 for contacts of one body. Ten times
-# more only take time.
+# Error of `ln |u|` that a step may make, as a share of the speed scale over the slip,
+# in tolerances of the flight, and at most. Ten times more: derivatives err by ten times
+# as much.
+TURNING = 10.0
+MOST_TURNING = 1e-3
+# Iterations for first directions: 1 for one contact, 3 to 4 for contacts of one body.
+# Ten times more only take time.
 _NEWTON = 6
 _MOST_TURN = 0.5  # [rad] in one of them; ten times more does not bound it
-# Beside a matrix of order 1: contacts of one body turn together, which makes it singular. Ten times
-# more: directions converge a tenth as fast.
+# Beside a matrix of order 1: contacts of one body turn together, which makes it
+# singular. Ten times more: directions converge a tenth as fast.
 _RIDGE = 1e-6
 
 
@@ -70,20 +78,26 @@ class SlipAxes(NamedTuple):
     along: Float[Array, "m 2"]  # direction d, in the tangents of the body
     speed: Float[Array, " m"]  # |u_0| [m/s], 0 where slip starts
     least: Float[Array, " m"]  # [m/s] the slip along d counts as at least that
-    last: Bool[Array, " m"]  # |u_0| <= LAST of the speed scale: the landing on its end is next
+    # |u_0| <= LAST of the speed scale: the landing on its end is next
+    last: Bool[Array, " m"]
 
 
 def slip_axes(
-    contacts: Contacts, mu: Float[Array, " m"], modes: Modes, speed_scale: Float[Array, ""]
+    contacts: Contacts,
+    mu: Float[Array, " m"],
+    modes: Modes,
+    speed_scale: Float[Array, ""],
 ) -> SlipAxes:
-    """Axes of a step that begins at these contacts: d = u / |u|, or `_first_directions` of u = 0.
+    """Axes of a step that begins at these contacts: d = u / |u|, or `_first_directions`
+    of u = 0.
 
     `speed_scale`: the largest gap velocity or slip that the motion could have [m/s].
     """
     assert contacts.tangent is not None
     m = len(mu)
     u = by_contact(contacts.tangent.rate, m)
-    speed, slides = length(u), modes.active & ~modes.stick
+    speed = length(u)
+    slides = modes.active & ~modes.stick
     starts = slides & (speed <= NO_SLIP * speed_scale)
     first = jnp.stack([jnp.ones_like(mu), jnp.zeros_like(mu)], axis=1)
     moving = jnp.where((slides & ~starts)[:, None], direction(u), first)
@@ -92,7 +106,8 @@ def slip_axes(
         lambda: _first_directions(contacts, mu, modes, starts, moving),
         lambda: moving,
     )
-    last, speed = speed <= LAST * speed_scale, jnp.where(starts, 0.0, speed)
+    last = speed <= LAST * speed_scale
+    speed = jnp.where(starts, 0.0, speed)
     # a derivative of the direction that is kept would be that of a turn which goes on
     kept = (last & (speed > 0))[:, None]
     along = jnp.where(kept, jax.lax.stop_gradient(along), along)
@@ -100,26 +115,33 @@ def slip_axes(
     return SlipAxes(along, speed, jnp.where(starts, FIRST * speed_scale, least), last)
 
 
-def slip_within(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Float[Array, "m 2"]:
-    """Directions of slip in the axes of the step: `max(|u . d|, least) d + (u . n) n`, normalized.
+def slip_within(
+    axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]
+) -> Float[Array, "m 2"]:
+    """Directions of slip in the axes of the step: `max(|u . d|, least) d + (u . n) n`,
+    normalized.
 
-    It is d where slip begins, or has not started. `rate` is the slip u in these axes [m/s].
+    It is d where slip begins, or has not started. `rate` is the slip u in these axes
+    [m/s].
     """
     u = by_contact(rate, len(axes.speed))
-    # behind its end slip counts as in front of it: its direction would be stiff at the least one
+    # behind its end slip counts as in front of it: its direction would be stiff at the
+    # least one
     ahead = jnp.maximum(jnp.abs(u[:, 0]), axes.least)
     none = (axes.speed == 0) & (u[:, 0] <= axes.least)
     straight = (modes.sign == BEGINS) | none
-    ahead, across = jnp.where(straight, 1.0, ahead), jnp.where(straight, 0.0, u[:, 1])
+    ahead = jnp.where(straight, 1.0, ahead)
+    across = jnp.where(straight, 0.0, u[:, 1])
     return direction(jnp.stack([ahead, across], axis=1))
 
 
 def straightened(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Modes:
-    """Modes that hold slip across its direction (`BEGINS`) where a step brings it to its end.
+    """Modes that hold slip across its direction (`BEGINS`) where a step brings it to
+    its end.
 
-    `rate` is the slip at the end of the step, in its axes [m/s]. The step before the end of a slip
-    knows one direction only, and drifts across it by as much as is left: the next step would begin
-    in any direction, and derivatives with it.
+    `rate` is the slip at the end of the step, in its axes [m/s]. The step before the
+    end of a slip knows one direction only, and drifts across it by as much as is left:
+    the next step would begin in any direction, and derivatives with it.
     """
     ahead = by_contact(rate, len(axes.speed))[:, 0]
     ends = modes.active & ~modes.stick & axes.last & (jnp.abs(ahead) < axes.speed)
@@ -129,7 +151,8 @@ def straightened(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Mode
 def log_rates(
     axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces
 ) -> Float[Array, " m"]:
-    """Rates `(ln |u|)' = u . u' / |u|^2` [1/s] where contacts slide, |u| at least `axes.least`.
+    """Rates `(ln |u|)' = u . u' / |u|^2` [1/s] where contacts slide, |u| at least
+    `axes.least`.
 
     0 elsewhere, and where slip is the `last` before its end.
     """
@@ -141,13 +164,16 @@ def log_rates(
     u = by_contact(contacts.tangent.rate, m)
     square = jnp.maximum(jnp.sum(u * u, axis=1), axes.least**2)
     slides = modes.active & ~modes.stick & (modes.sign != BEGINS) & ~axes.last
-    return jnp.where(slides, jnp.sum(u * growth, axis=1) / jnp.where(slides, square, 1.0), 0.0)
+    return jnp.where(
+        slides, jnp.sum(u * growth, axis=1) / jnp.where(slides, square, 1.0), 0.0
+    )
 
 
 def turning_errors(
     axes: SlipAxes, rtol: float, speed_scale: Float[Array, ""]
 ) -> Float[Array, " m"]:
-    """Errors of `ln |u|` that a step may make: `TURNING rtol max(1, speed_scale / |u_0|)`.
+    """Errors of `ln |u|` that a step may make:
+    `TURNING rtol max(1, speed_scale / |u_0|)`.
 
     At most `MOST_TURNING`, and that where the slip is the `last` before its end.
     """
@@ -165,25 +191,35 @@ def _first_directions(
 ) -> Float[Array, "m 2"]:
     """Directions d of slip from rest where it `starts`, elsewhere the `moving` ones.
 
-    Equation: slip starts along its own acceleration, `d x u' = 0` with `u' = a + W lambda` and the
-    friction `lambda_t = -mu lambda_n d`: Newton's iterations on the angles of d, which begin
-    against the forces that would make the contacts stick.
+    Equation: slip starts along its own acceleration, `d x u' = 0` with
+    `u' = a + W lambda` and the friction `lambda_t = -mu lambda_n d`: Newton's
+    iterations on the angles of d, which begin against the forces that would make the
+    contacts stick.
     """
     m = len(mu)
-    plain = modes._replace(sign=jnp.ones_like(modes.sign))  # slip along d, not against it
+    # slip along d, not against it
+    plain = modes._replace(sign=jnp.ones_like(modes.sign))
     stuck = forces(contacts, mu, plain._replace(stick=modes.stick | starts), moving)
     assert stuck.tangential is not None
     against = -by_contact(stuck.tangential, m)
     some = starts & (length(against) > 0)
-    angle = jnp.arctan2(jnp.where(some, against[:, 1], 0.0), jnp.where(some, against[:, 0], 1.0))
+    angle = jnp.arctan2(
+        jnp.where(some, against[:, 1], 0.0), jnp.where(some, against[:, 0], 1.0)
+    )
 
     def unit(angle: Float[Array, " m"]) -> Float[Array, "m 2"]:
-        """Directions d = (cos, sin) of the angles where slip starts, else the moving ones."""
+        """Directions d = (cos, sin) of the angles where slip starts, else the moving
+        ones.
+        """
         turned = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
         return jnp.where(starts[:, None], turned, moving)
 
-    def across(angle: Float[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """`d x u'` where slip starts, twice: `jacfwd` returns the second beside the Jacobian."""
+    def across(
+        angle: Float[Array, " m"],
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """`d x u'` where slip starts, twice: `jacfwd` returns the second beside the
+        Jacobian.
+        """
         d = unit(angle)
         sliding = forces(contacts, mu, plain, d)
         assert sliding.tangential is not None
@@ -199,7 +235,8 @@ def _first_directions(
         jacobian, turn = jax.jacfwd(across, has_aux=True)(angle)
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(jacobian)))
         size = jnp.where(size > 0, size, 1.0)
-        # friction makes the diagonal negative: a little more keeps it regular; other angles stay
+        # friction makes the diagonal negative: a little more keeps it regular; other
+        # angles stay
         ridge = jnp.where(starts, -_RIDGE, 1.0)
         equations = jacobian / size + eye * ridge[:, None]
         change = solve_by_pivots(equations, -turn[:, None] / size)[0][:, 0]

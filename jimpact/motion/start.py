@@ -11,33 +11,44 @@ from jaxtyping import Array, Float
 from jimpact.bodies.base import check_penetration, check_range
 from jimpact.core.law import Law
 from jimpact.core.scene import check_mass
-from jimpact.motion.dynamics import Mass, is_pile, mass_at, recorded_gaps, seen_from_base
+from jimpact.motion.dynamics import (
+    Mass,
+    is_pile,
+    mass_at,
+    recorded_gaps,
+    seen_from_base,
+)
 from jimpact.motion.system import System, check_functions
 from jimpact.tools.checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.tools.compiling import precise_jit
 from jimpact.tools.precision import precision
 
-# Instants at which the base must be finite before a motion starts; what is not finite in between
-# ends the motion with the status `not_finite`.
+# Instants at which the base must be finite before a motion starts; what is not finite
+# in between ends the motion with the status `not_finite`.
 BASE_INSTANTS = 64
-# [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few nanometres
-# apart are struck together.
+# [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few
+# nanometres apart are struck together.
 CLOSED_BELOW = 1e-9
-ROUNDING_GAP = 1e-5  # of the gap that counts as closed: smaller gaps are rounding, hops as well
-# What counts as closed is so many times more than what a gap may be off by. In metres and double
-# precision it does not matter.
+# of the gap that counts as closed: smaller gaps are rounding, hops as well
+ROUNDING_GAP = 1e-5
+# What counts as closed is so many times more than what a gap may be off by. In metres
+# and double precision it does not matter.
 MORE_CLOSED = 10
 
 
 class Start(NamedTuple):
-    """Checked start of a motion: system, state, times, friction, and which gaps are closed."""
+    """Checked start of a motion: system, state, times, friction, and which gaps are
+    closed.
+    """
 
-    system: System  # arrays that its functions close over are leaves, where they are traced
+    # arrays that its functions close over are leaves, where they are traced
+    system: System
     q: Float[Array, " nq"]
     v: Float[Array, " n"]
     time: Float[Array, ""]  # [s]
     end: Float[Array, ""]  # [s]
-    friction: Float[Array, "..."] | None  # mu (m,), () of a pile; None: no contact has friction
+    # mu (m,), () of a pile; None: no contact has friction
+    friction: Float[Array, "..."] | None
     closed_below: Float[Array, ""]  # [m] contacts with smaller gaps are closed
     gap_rounding: Float[Array, ""]  # [m] smaller gaps are rounding
     contacts: int  # m
@@ -53,18 +64,20 @@ def start_of(
     closed_below: float | None = None,
     may_penetrate: bool = False,
 ) -> Start:
-    """Start of a motion at q, v that ends at `t_end`, a time or the pair (t_start, t_end) [s].
+    """Start of a motion at q, v that ends at `t_end`, a time or the pair (t_start,
+    t_end) [s].
 
     `closed_below` [m] as of `EventDriven`.
 
     Raises:
-        ValueError: for shapes and values that cannot be used, penetration but where it `may` be.
-            TypeError: for functions of the system that JAX cannot trace.
+        ValueError: for shapes and values that cannot be used, penetration but where it
+            `may` be. TypeError: for functions of the system that JAX cannot trace.
     """
     start, end = (as_float_array("t_end", t).astype(q.dtype) for t in as_times(t_end))
     _check_coordinates(system, q, v, start, end)
     here = _at_start(system, q, v, start, end)
-    if is_traced(here):  # `q`, an array of the system, or one that its functions close over
+    # `q`, an array of the system, or one that its functions close over
+    if is_traced(here):
         system = _with_closures_as_leaves(system, q, v, start)
     else:
         _check_values_at_start(system, here, start, end)
@@ -72,8 +85,14 @@ def start_of(
     if not may_penetrate:
         check_penetration("q0", here.gaps, jnp.maximum(below, system.body.overlap))
     friction = _friction_of(system, law, here)
-    in_space = friction is not None and here.tangents == 2 * here.contacts and not is_pile(system)
-    return Start(system, q, v, start, end, friction, below, rounding, here.contacts, in_space)
+    in_space = (
+        friction is not None
+        and here.tangents == 2 * here.contacts
+        and not is_pile(system)
+    )
+    return Start(
+        system, q, v, start, end, friction, below, rounding, here.contacts, in_space
+    )
 
 
 def as_times(t_end: Any) -> tuple[Any, Any]:
@@ -82,7 +101,8 @@ def as_times(t_end: Any) -> tuple[Any, Any]:
         return 0.0, t_end
     if len(t_end) != 2:
         raise ValueError(
-            f"Argument `t_end` must be a time or a pair (t_start, t_end), but has value {t_end!r}."
+            f"Argument `t_end` must be a time or a pair (t_start, t_end), but has "
+            f"value {t_end!r}."
         )
     start, end = t_end
     return start, end
@@ -93,20 +113,34 @@ def _check_coordinates(
 ) -> None:
     """Raise for coordinates, velocities and times of wrong shapes or values.
 
-    The body, or else its constant mass, says how many there are; a body with quaternions has more
-    coordinates than velocities. With a mass M(q), `check_functions` compares v with M.
+    The body, or else its constant mass, says how many there are; a body with
+    quaternions has more coordinates than velocities. With a mass M(q),
+    `check_functions` compares v with M.
     """
     if q.ndim != 1:
-        raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
-    coordinates, mass = system.body.coordinates, system.body.mass
+        raise ValueError(
+            f"Argument `q0` must have shape (n,), but has shape {q.shape}."
+        )
+    coordinates = system.body.coordinates
+    mass = system.body.mass
     if coordinates is not None:
         check_shape("q0", q, (coordinates,), "the coordinates of the body")
     elif not callable(mass):
-        check_shape("q0", q, mass.shape[:1], "the coordinates of the body, as many as its mass has")
+        check_shape(
+            "q0",
+            q,
+            mass.shape[:1],
+            "the coordinates of the body, as many as its mass has",
+        )
     if coordinates is None:
         check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
     elif not callable(mass):
-        check_shape("v0", v, mass.shape[:1], "the velocities of the body, as many as its mass has")
+        check_shape(
+            "v0",
+            v,
+            mass.shape[:1],
+            "the velocities of the body, as many as its mass has",
+        )
     for time in (start, end):
         check_shape("t_end", time, (), "a time, or a pair (t_start, t_end)")
     # the argument `t_end` may hold the start, too
@@ -125,10 +159,13 @@ class _AtStart(NamedTuple):
     mass: Mass
     gaps: Float[Array, " m"]  # [m], of a pile the least one alone
     valid: Float[Array, ""]  # margin of the range of the gap function
-    base: Float[Array, "instants d"] | None  # [m] displacements at BASE_INSTANTS instants
-    others: list[Any]  # values of all other functions: traced where one closes over traced arrays
+    # [m] displacements at BASE_INSTANTS instants
+    base: Float[Array, "instants d"] | None
+    # values of all other functions: traced where one closes over traced arrays
+    others: list[Any]
     contacts: int  # m
-    tangents: int | None  # number of tangential displacements; None: no friction is possible
+    # number of tangential displacements; None: no friction is possible
+    tangents: int | None
 
 
 @precise_jit
@@ -139,7 +176,8 @@ def _at_start(
     start: Float[Array, ""],
     end: Float[Array, ""],
 ) -> _AtStart:
-    """Values of the functions of a system at (q, v, start), which `check_functions` has checked.
+    """Values of the functions of a system at (q, v, start), which `check_functions` has
+    checked.
 
     The base is taken at equally spaced instants from start to end.
     """
@@ -147,7 +185,8 @@ def _at_start(
     body = system.body
     base = None
     if system.base is not None:
-        displacement, instants = system.base, jnp.linspace(start, end, BASE_INSTANTS)
+        displacement = system.base
+        instants = jnp.linspace(start, end, BASE_INSTANTS)
         base = jax.vmap(lambda t: jnp.atleast_1d(displacement(t)))(instants)
     loads = (system.potential, (q,)), (system.force, (q, v, start))
     others = [*loads, *((function, (q,)) for function in body.functions)]
@@ -187,14 +226,18 @@ def _with_closures_as_leaves(
     """System in which traced arrays that its functions close over are leaves."""
 
     def converted(function: Any, *args: jax.Array) -> Any:
-        """Function as a pytree of the arrays that it closes over, if they are traced."""
+        """Function as a pytree of the arrays that it closes over, if they are
+        traced.
+        """
         if isinstance(function, eqx.Module) or not callable(function):
             return function
         args = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
         if not is_traced(function(*args)):
             return function
         new = eqx.filter_closure_convert(function, *args)
-        return new if is_traced(new) else function
+        if is_traced(new):
+            return new
+        return function
 
     def parts(s: System) -> list[Any]:
         """Functions of a system: force, potential, base, and those of its body."""
@@ -210,24 +253,38 @@ def _closed_gaps(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Gap [m] below which a contact is closed, and gap [m] below which it is rounding.
 
-    Equation: `closed_below`, by default `max(CLOSED_BELOW, MORE_CLOSED noise max(|q|, |f|))`; and
-    `max(ROUNDING_GAP closed_below, noise max(|q|, |f|))`.
+    Equation: `closed_below`, by default `max(CLOSED_BELOW, MORE_CLOSED noise max(|q|,
+    |f|))`; and `max(ROUNDING_GAP closed_below, noise max(|q|, |f|))`.
     """
     q, f = jax.lax.stop_gradient((q, f))
     numpy: Any = jnp if is_traced((q, f)) else np  # on the host nothing is compiled
-    off = precision(q.dtype).noise * numpy.maximum(numpy.abs(q).max(), numpy.abs(f).max())
-    below = numpy.maximum(CLOSED_BELOW, MORE_CLOSED * off) if closed_below is None else closed_below
+    off = precision(q.dtype).noise * numpy.maximum(
+        numpy.abs(q).max(), numpy.abs(f).max()
+    )
+    if closed_below is None:
+        below = numpy.maximum(CLOSED_BELOW, MORE_CLOSED * off)
+    else:
+        below = closed_below
     rounding = numpy.maximum(ROUNDING_GAP * below, off)
     return jnp.asarray(below, q.dtype), jnp.asarray(rounding, q.dtype)
 
 
-def _friction_of(system: System, law: Law, here: _AtStart) -> Float[Array, "..."] | None:
-    """Coefficients mu (m,), () of a pile: of the system, or else of the law; None if all are 0."""
+def _friction_of(
+    system: System, law: Law, here: _AtStart
+) -> Float[Array, "..."] | None:
+    """Coefficients mu (m,), () of a pile: of the system, or else of the law; None if
+    all are 0.
+    """
     own = system.friction is not None
-    mu = system.friction if own else getattr(law, "friction", None)
+    if own:
+        mu = system.friction
+    else:
+        mu = getattr(law, "friction", None)
     if mu is None:
         return None
-    mu, dtype, m = jnp.asarray(mu), here.gaps.dtype, here.contacts
+    mu = jnp.asarray(mu)
+    dtype = here.gaps.dtype
+    m = here.contacts
     if not is_traced(mu) and not np.asarray(mu).any():
         return None  # frictionless systems pay nothing
     if here.tangents is None:
@@ -239,12 +296,15 @@ def _friction_of(system: System, law: Law, here: _AtStart) -> Float[Array, "..."
         mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
     if here.tangents not in (m, 2 * m):
         raise ValueError(
-            "Argument `system` must have one tangent a contact in the plane, two in space: "
+            "Argument `system` must have one tangent a contact in the plane, two in "
+            "space: "
             f"{m} or {2 * m} for its {m} contacts, but has {here.tangents}."
         )
     if is_pile(system):
         check_shape("friction", mu, (), "one for all contacts of a pile")
         return mu.astype(dtype)
     if mu.shape not in ((), (m,)):
-        raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
+        raise ValueError(
+            f"Argument `friction` must have shape () or ({m},), but has {mu.shape}."
+        )
     return jnp.broadcast_to(mu, (m,)).astype(dtype)

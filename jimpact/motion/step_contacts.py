@@ -1,8 +1,10 @@
-"""The contacts of one step of time stepping: products with their directions, dense or of a pile.
+"""The contacts of one step of time stepping: products with their directions, dense or
+of a pile.
 
-Both classes have the same methods. Each of m contacts has b directions: its normal, then with
-friction its tangents (1 in the plane, 2 in space). Of a pile (`Bodies` with `room`) only contacts
-that are closed are stored, and products go over the pairs of bodies, block by block.
+Both classes have the same methods. Each of m contacts has b directions: its normal,
+then with friction its tangents (1 in the plane, 2 in space). Of a pile (`Bodies` with
+`room`) only contacts that are closed are stored, and products go over the pairs of
+bodies, block by block.
 """
 
 from typing import Any, NamedTuple
@@ -69,7 +71,9 @@ class AllContacts(NamedTuple):
 
 
 class PileImpulses(NamedTuple):
-    """Impulses of the closed contacts of a pile, by increasing numbers of the contacts."""
+    """Impulses of the closed contacts of a pile, by increasing numbers of the
+    contacts.
+    """
 
     number: Int[Array, " m"]
     impulse: Float[Array, "m b"]  # [N s]
@@ -79,7 +83,8 @@ class ActiveContacts(NamedTuple):
     """The closed contacts of a pile in one step; methods as those of `AllContacts`."""
 
     pairs: ActivePairs
-    inverse: Float[Array, "bodies+1 velocities"]  # 1 / M of each body, 0 for walls (the last row)
+    # 1 / M of each body, 0 for walls (the last row)
+    inverse: Float[Array, "bodies+1 velocities"]
 
     @property
     def closed(self) -> Bool[Array, " m"]:
@@ -91,8 +96,12 @@ class ActiveContacts(NamedTuple):
         of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
 
         def one(row: Int[Array, ""], rates: Float[Array, "m b"]) -> Float[Array, "m b"]:
-            """Rates with those of one block of contacts, `D . v` of their two bodies."""
-            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            """Rates with those of one block of contacts, `D . v` of their two
+            bodies.
+            """
+            bodies, directions = (
+                block(x, row) for x in (self.pairs.bodies, self.pairs.directions)
+            )
             values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
             return with_block(rates, values, row)
 
@@ -110,9 +119,13 @@ class ActiveContacts(NamedTuple):
     def generalized_impulse(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Generalized impulse `D x` of impulses x [N s]."""
 
-        def one(row: Int[Array, ""], impulses: Float[Array, "k u"]) -> Float[Array, "k u"]:
+        def one(
+            row: Int[Array, ""], impulses: Float[Array, "k u"]
+        ) -> Float[Array, "k u"]:
             """Impulses `sum D x` on the bodies, with those of one block of contacts."""
-            bodies, directions = (block(y, row) for y in (self.pairs.bodies, self.pairs.directions))
+            bodies, directions = (
+                block(y, row) for y in (self.pairs.bodies, self.pairs.directions)
+            )
             each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
             return impulses.at[bodies].add(each)
 
@@ -127,9 +140,13 @@ class ActiveContacts(NamedTuple):
     def diagonal(self) -> Float[Array, "m b"]:
         """Diagonal of the Delassus matrix (m, b): `sum D^2 / M` over both bodies."""
 
-        def one(row: Int[Array, ""], diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
+        def one(
+            row: Int[Array, ""], diagonal: Float[Array, "m b"]
+        ) -> Float[Array, "m b"]:
             """Diagonal with the part of one block of contacts."""
-            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            bodies, directions = (
+                block(x, row) for x in (self.pairs.bodies, self.pairs.directions)
+            )
             squares = directions**2 * self.inverse[bodies][:, None]
             return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
 
@@ -137,7 +154,9 @@ class ActiveContacts(NamedTuple):
         return over_blocks(self.pairs.filled, one, start)
 
     def warm_start(self, last: Any) -> Float[Array, "m b"]:
-        """Impulses of the last step at the same contacts, found by number; 0 of new ones."""
+        """Impulses of the last step at the same contacts, found by number; 0 of new
+        ones.
+        """
         row = jnp.searchsorted(last.number, self.pairs.number)
         row = jnp.minimum(row, last.number.size - 1)
         same = self.closed & (last.number[row] == self.pairs.number)
@@ -147,7 +166,9 @@ class ActiveContacts(NamedTuple):
         """Impulses x in the form in which `warm_start` of the next step reads them."""
 
         def in_order() -> PileImpulses:
-            """Impulses by increasing number, so that the next step can search for them."""
+            """Impulses by increasing number, so that the next step can search for
+            them.
+            """
             order = jnp.argsort(self.pairs.number)
             return PileImpulses(self.pairs.number[order], x[order])
 
@@ -168,16 +189,19 @@ def contacts_of_step(
     closed_below: Float[Array, ""],
     friction: bool,
 ) -> AllContacts | ActiveContacts:
-    """Contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end.
+    """Contacts of a step whose middle is at (q, t), and its end, without contacts, at
+    q_end.
 
-    Closed are those with a gap of at most `closed_below` [m] at one of these; directions and mass
-    are those in the middle.
+    Closed are those with a gap of at most `closed_below` [m] at one of these;
+    directions and mass are those in the middle.
     """
-    at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
+    at = seen_from_base(system, q, t)
+    end = seen_from_base(system, q_end, t_end)
     mass = mass_at(system, q)
     if is_pile(system):
         pairs = system.body.active_pairs(at, end, closed_below)
-        pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
+        if not friction:
+            pairs = pairs._replace(directions=pairs.directions[:, :1])
         of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
         return ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
     gap, normals, tangents = system.body.directions(at, friction)
@@ -195,12 +219,16 @@ def contacts_of_step(
 
 
 def check_stepped_law(system: System, law: Law, contacts: int, joint: bool) -> None:
-    """Raise unless time stepping of the system can use the law; `joint` as in `time_stepping`."""
+    """Raise unless time stepping of the system can use the law; `joint` as in
+    `time_stepping`.
+    """
     if not joint:
         if is_pile(system):
             raise ValueError(
-                "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
-                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
+                "Argument `law` must be Moreau's, with its own `friction` and without "
+                "a matrix, "
+                f"for the many contacts of {type(system.body).__name__}, but is "
+                f"{law!r}."
             )
         return
     for name in ("restitution", "tangential_restitution"):

@@ -1,24 +1,27 @@
-"""Moreau-Jean time stepping with any impact law: for many contacts, no event is located.
+"""Moreau-Jean time stepping with any impact law: for many contacts, no event is
+located.
 
 One step of length h (after Remark 6.9 of Brogliato):
 
-    q_m = q + h/2 v                              closed: here, or at the end by forces alone
+    q_m = q + h/2 v                              closed: here, or at the end by forces
+    alone
     v'  = v + h M^-1 F + M^-1 (N p + H p_t)      0 <= p _|_ gamma' + w >= 0
     q'  = q_m + h/2 v'                           p_t in -mu p Sgn(u' + w_t)
 
-with `w = e gamma` for a contact that approaches by Moreau's law, which joins the problem this way.
-Any other law acts first, in the middle of the forces, `v+ = impact(law, scene(q_m), v + h/2 M^-1
-F)`, and slow approach (within what forces give in two steps) is rest, `w = 0`. Order 1: an impact
-is early or late by up to h / 2.
+with `w = e gamma` for a contact that approaches by Moreau's law, which joins the
+problem this way. Any other law acts first, in the middle of the forces,
+`v+ = impact(law, scene(q_m), v + h/2 M^-1 F)`, and slow approach (within what forces
+give in two steps) is rest, `w = 0`. Order 1: an impact is early or late by up to h / 2.
 
-ENERGY. A contact gives `p (gamma' + gamma) / 2`: no energy where `w >= gamma`. So a contact that
-separates may come back as fast as it leaves, `w = gamma`, and is at rest two steps later. Friction
-opposes the slip at the end, `w_t = 0` (`e_t u` in an impact). That may give energy where the slip
-reverses within the step, up to (h g)^2 in a stop on a slope, and more in Kane's paradox; such a
-step is solved again with all friction against the mean slip, `w_t = u`, which cannot.
+ENERGY. A contact gives `p (gamma' + gamma) / 2`: no energy where `w >= gamma`. So a
+contact that separates may come back as fast as it leaves, `w = gamma`, and is at rest
+two steps later. Friction opposes the slip at the end, `w_t = 0` (`e_t u` in an impact).
+That may give energy where the slip reverses within the step, up to (h g)^2 in a stop on
+a slope, and more in Kane's paradox; such a step is solved again with all friction
+against the mean slip, `w_t = u`, which cannot.
 
-DERIVATIVES of such a step do not converge: with h the time of an impact is constant, while its
-derivative is not. They are refused.
+DERIVATIVES of such a step do not converge: with h the time of an impact is constant,
+while its derivative is not. They are refused.
 """
 
 from typing import Any, NamedTuple
@@ -45,7 +48,12 @@ from jimpact.motion.dynamics import (
 from jimpact.motion.flow import State, out_of_range, status_at_start
 from jimpact.motion.record import KIND_CODE, Events, no_events, with_row
 from jimpact.motion.start import Start
-from jimpact.motion.step_contacts import ActiveContacts, AllContacts, PileImpulses, contacts_of_step
+from jimpact.motion.step_contacts import (
+    ActiveContacts,
+    AllContacts,
+    PileImpulses,
+    contacts_of_step,
+)
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
@@ -55,32 +63,41 @@ from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
 # Gap velocities below _ROUNDING times the largest speed of the motion, or its
-# rounding, are what solving for contacts at rest leaves. Ten times less, and resting beads strike
-# in every step; ten times more, and slow impacts come a step later.
+# rounding, are what solving for contacts at rest leaves. Ten times less, and resting
+# beads strike in every step; ten times more, and slow impacts come a step later.
 _ROUNDING = 1e-12
 SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an impact
-# Misfit of a step's impulses over its velocities at which the solver ends: for a few contacts, for
-# a pile; at least rounding, which matters in float32. Ten times more, and what rests
+# Misfit of a step's impulses over its velocities at which the solver ends: for a few
+# contacts, for a pile; at least rounding, which matters in float32. Ten times more, and
+# what rests
 # creeps ten times faster.
-FEW, PILE = 1e-9, 1e-6
-OFF = 1e-2  # misfit above which `unsolved_step` is reported; ten times more is no solution
-ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
-MEAN = 4  # iterations of the mean velocity in the forces; the error falls by h omega (spin) each
-# Share of the speed that the velocities could give a gap, by which its rate changes where bodies
-# pass each other in a step: head-on it is 2. Ten times less would report corners that roll over the
-# ground, ten times more would hide oblique passages. What the free acceleration of SLOW steps
-# explains is no passage.
+FEW = 1e-9
+PILE = 1e-6
+# misfit above which `unsolved_step` is reported; ten times more is no solution
+OFF = 1e-2
+# of the solver, per step; ten times more costs time in jammed piles only
+ITERATIONS = 1000
+# iterations of the mean velocity in the forces; the error falls by h omega (spin) each
+MEAN = 4
+# Share of the speed that the velocities could give a gap, by which its rate changes
+# where bodies pass each other in a step: head-on it is 2. Ten times less would report
+# corners that roll over the ground, ten times more would hide oblique passages. What
+# the free acceleration of SLOW steps explains is no passage.
 TURN = 0.1
-# Steps: a contact that is struck again within them by an impact that is HARD, of more than this
-# share of the largest gap velocity so far, is reported as `coarse_step`. Each impact is early or
-# late by up to h / 2; one below that share adds less than that share to the error in q that the
-# fastest impact makes anyway. Ten times less reports stacks that come to rest, ten times more
-# hides rebounds whose order the step does not resolve.
-APART, HARD = 3, 0.1
+# Steps: a contact that is struck again within them by an impact that is HARD, of more
+# than this share of the largest gap velocity so far, is reported as `coarse_step`. Each
+# impact is early or late by up to h / 2; one below that share adds less than that share
+# to the error in q that the fastest impact makes anyway. Ten times less reports stacks
+# that come to rest, ten times more hides rebounds whose order the step does not
+# resolve.
+APART = 3
+HARD = 0.1
 
 WHY = (
-    "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
-    "times of impacts are fixed, so that derivatives do not converge. method='events' has them."
+    "Argument `method` must not be 'time_stepping' where derivatives are taken: with "
+    "the step the "
+    "times of impacts are fixed, so that derivatives do not converge. method='events' "
+    "has them."
 )
 
 
@@ -99,19 +116,23 @@ class _Progress(NamedTuple):
     """The motion up to now."""
 
     state: State
-    speed: Float[Array, ""]  # [m/s] largest gap velocity that velocities could give so far
+    # [m/s] largest gap velocity that velocities could give so far
+    speed: Float[Array, ""]
     last_impulses: Float[Array, "m b"] | PileImpulses  # [N s] of the last step
     residual_velocity: Float[Array, ""]  # [m/s] gap velocity that these leave unsolved
     inverse_step_size: Float[Array, ""]  # of the solver, see `solve_many`
     steps_since_impact: Int[Array, " m"]
-    closing: Float[Array, " m"]  # [m/s] rates of gaps that close before the next step; others 0
+    # [m/s] rates of gaps that close before the next step; others 0
+    closing: Float[Array, " m"]
     events: Events
     status: Int[Array, ""]
     reported: Int[Array, ""]  # a status that is not a failure
 
 
 class _Setup(NamedTuple):
-    """Data of a step before it is solved: contacts in its middle, and the law's impulses there."""
+    """Data of a step before it is solved: contacts in its middle, and the law's
+    impulses there.
+    """
 
     middle: Float[Array, ""]  # [s] time in the middle of the step
     end: Float[Array, ""]  # [s] time at its end
@@ -121,13 +142,15 @@ class _Setup(NamedTuple):
     contacts: AllContacts | ActiveContacts
     speed: Float[Array, ""]  # as in `_Progress`
     noise: Float[Array, ""]  # [m/s] smaller gap velocities are rounding
-    slow: Float[Array, " m"]  # [m/s] gap velocities of SLOW steps of the free acceleration, noise
+    # [m/s] gap velocities of SLOW steps of the free acceleration, noise
+    slow: Float[Array, " m"]
     tolerance: float  # of the solver
     strikes: Bool[Array, " m"]  # the contact has an impact
     law_velocity: Float[Array, " n"]  # velocity to which the law is applied
     law_impulse: Float[Array, "m b"]  # [N s] of a law that does not join the problem
     law_status: Int[Array, ""]
-    rates: Float[Array, "m b"]  # [m/s] of gaps and slips, after those impulses, before forces
+    # [m/s] of gaps and slips, after those impulses, before forces
+    rates: Float[Array, "m b"]
     offset: Float[Array, "m b"]  # w with friction against the slip at the end
     offset_for_mean: Float[Array, "m b"]  # w with friction against the mean slip
 
@@ -151,18 +174,26 @@ def time_stepping(
     joint: bool,
     max_events: int,
 ) -> Course:
-    """The motion with `substeps` equal steps between neighbours of the sampled `times` [s].
+    """The motion with `substeps` equal steps between neighbours of the sampled `times`
+    [s].
 
-    `joint`: the law is a condition on v' that joins the problem of the step (`Law.joins_step`).
+    `joint`: the law is a condition on v' that joins the problem of the step
+    (`Law.joins_step`).
     """
-    start, law, times = without_derivatives((start, law, times), NotImplementedError(WHY))
+    start, law, times = without_derivatives(
+        (start, law, times), NotImplementedError(WHY)
+    )
     h = (times[1] - times[0]) / substeps.astype(times.dtype)
-    problem = _StepProblem(start.system, law, start.friction, h, start.closed_below, joint)
+    problem = _StepProblem(
+        start.system, law, start.friction, h, start.closed_below, joint
+    )
     first = _begin(problem, start.q, start.v, times, substeps, max_events)
     dtype = times.dtype
 
     def to_sample(progress: _Progress, t: Float[Array, ""]) -> tuple[_Progress, State]:
-        """Motion from the sample at t to the next one, and the state there; NaN after a failure."""
+        """Motion from the sample at t to the next one, and the state there; NaN after a
+        failure.
+        """
 
         def one(i: Int[Array, ""], progress: _Progress) -> _Progress:
             """Step number i from t, unless the motion has failed."""
@@ -174,10 +205,14 @@ def time_stepping(
 
         progress = jax.lax.fori_loop(0, substeps, one, progress)
         fine = progress.status == CODE["ok"]
-        return progress, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
+        return progress, jax.tree.map(
+            lambda x: jnp.where(fine, x, jnp.nan), progress.state
+        )
 
     end, later = jax.lax.scan(to_sample, first, times[:-1])
-    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first.state, later)
+    samples = jax.tree.map(
+        lambda x, rest: jnp.concatenate([x[None], rest]), first.state, later
+    )
     steps = substeps * (times.shape[0] - 1)
     status = jnp.where(end.status == CODE["ok"], end.reported, end.status)
     return Course(samples, end.events, steps, status)
@@ -196,7 +231,9 @@ def step_of_pile(start: Start, law: Law) -> PileStep:
     """The one step of a pile from the time of `start` to its end."""
     times = jnp.stack([start.time, start.end])
     h = start.end - start.time
-    problem = _StepProblem(start.system, law, start.friction, h, start.closed_below, joint=True)
+    problem = _StepProblem(
+        start.system, law, start.friction, h, start.closed_below, joint=True
+    )
     first = _begin(problem, start.q, start.v, times, jnp.int32(1), 1)
     setup = _set_up(problem, first, times[0])
     trial = _solve(problem, first, setup)
@@ -216,14 +253,21 @@ def _begin(
     substeps: Int[Array, ""],
     max_events: int,
 ) -> _Progress:
-    """Motion at the start: impulses of the last step are 0, its status that of the start."""
+    """Motion at the start: impulses of the last step are 0, its status that of the
+    start.
+    """
     system, law, mu, _, closed_below, _ = problem
-    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
+    zero = jnp.zeros((), q0.dtype)
+    dtype = q0.dtype
     m = recorded_gaps(system, q0, times[0]).shape[0]
 
     def first() -> tuple[Float[Array, "m b"], Any]:
-        """Rates of contacts, and impulses as steps keep them: their shapes are used alone."""
-        at = contacts_of_step(system, q0, times[0], q0, times[0], closed_below, mu is not None)
+        """Rates of contacts, and impulses as steps keep them: their shapes are used
+        alone.
+        """
+        at = contacts_of_step(
+            system, q0, times[0], q0, times[0], closed_below, mu is not None
+        )
         rates = at.rates(v0)
         return rates, at.kept(rates)
 
@@ -232,7 +276,10 @@ def _begin(
     contacts, b = at_rest.shape
     rest = jnp.zeros((2, m), dtype)
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
-    rows = 1 if is_pile(system) else max_events
+    if is_pile(system):
+        rows = 1
+    else:
+        rows = max_events
     events = no_events(rows, q0, v0, m, tangents=m * max(b - 1, 1))
     status = status_at_start(system, begin, times[-1], closed_below)
     fails = (status == CODE["ok"]) & ~within_domains(law)
@@ -251,13 +298,16 @@ def _begin(
     )
 
 
-def _one_step(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> _Progress:
+def _one_step(
+    problem: _StepProblem, progress: _Progress, t: Float[Array, ""]
+) -> _Progress:
     """Motion after one step of length h from t."""
     setup = _set_up(problem, progress, t)
     trial = _solve(problem, progress, setup)
     state, energy = _end_state(problem, progress, setup, trial)
     status, reported = _status(problem, progress, setup, trial, state)
-    solution, contacts = trial.solution, setup.contacts
+    solution = trial.solution
+    contacts = setup.contacts
     return _Progress(
         state=state,
         speed=setup.speed,
@@ -279,7 +329,9 @@ def _loads(
     t: Float[Array, ""],
     mass: Mass,
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Force F(q, v, t) of the argument `force`, and the acceleration v' without contacts."""
+    """Force F(q, v, t) of the argument `force`, and the acceleration v' without
+    contacts.
+    """
     force = user_force(system, q, v, t)
     return force, free_acceleration(system, q, v, force, mass)
 
@@ -287,17 +339,23 @@ def _loads(
 def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> _Setup:
     """Data of the step that begins at t: contacts in its middle, impacts, offsets w.
 
-    A closed contact strikes where `gamma < -slow`. The law acts there unless it is `joint`.
+    A closed contact strikes where `gamma < -slow`. The law acts there unless it is
+    `joint`.
     """
     system, law, mu, h, closed_below, joint = problem
-    state, dtype, body = progress.state, progress.state.q.dtype, system.body
-    middle, end = t + 0.5 * h, t + h
+    state = progress.state
+    dtype = progress.state.q.dtype
+    body = system.body
+    middle = t + 0.5 * h
+    end = t + h
     q = body.moved(state.q, 0.5 * h * state.v)
     base_velocity = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
     free = _loads(system, q, state.v, middle, mass)[1]
     q_predicted = body.moved(q, 0.5 * h * (state.v + h * free))
-    contacts = contacts_of_step(system, q, middle, q_predicted, end, closed_below, mu is not None)
+    contacts = contacts_of_step(
+        system, q, middle, q_predicted, end, closed_below, mu is not None
+    )
     before = contacts.rates(state.v - base_velocity)
     rounding = precision(dtype).accumulated
     speed = jnp.maximum(progress.speed, contacts.fastest(state.v))
@@ -306,10 +364,14 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
     noise += tolerance * contacts.fastest(h * free)
     slow = noise + SLOW * h * jnp.abs(contacts.rates(free)[:, 0])
     strikes = contacts.closed & (before[:, 0] < -slow)
-    # half of the forces before an impact, half after it: over the whole step they take as much
-    # energy from the velocities as the potential gains
-    law_velocity = state.v if joint else state.v + 0.5 * h * free
-    impulse, law_status = jnp.zeros_like(before), jnp.int32(CODE["ok"])
+    # half of the forces before an impact, half after it: over the whole step they take
+    # as much energy from the velocities as the potential gains
+    if joint:
+        law_velocity = state.v
+    else:
+        law_velocity = state.v + 0.5 * h * free
+    impulse = jnp.zeros_like(before)
+    law_status = jnp.int32(CODE["ok"])
     if not joint:
         scene = scene_at(system, q, middle, contacts.closed)
         relative = law_velocity - base_velocity
@@ -346,30 +408,45 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
 def _coefficients(
     problem: _StepProblem, strikes: Bool[Array, " m"], dtype: jnp.dtype
 ) -> tuple[Float[Array, "..."], Float[Array, " m"]]:
-    """Restitution e () or (m,), and e_t where contacts strike; 0 unless the law `joins_step`."""
-    e, e_t = jnp.zeros((), dtype), jnp.zeros((), dtype)
+    """Restitution e () or (m,), and e_t where contacts strike; 0 unless the law
+    `joins_step`.
+    """
+    e = jnp.zeros((), dtype)
+    e_t = jnp.zeros((), dtype)
     if problem.joint:
         law: Any = problem.law
         e = law.restitution
-        e_t = e_t if law.tangential_restitution is None else law.tangential_restitution
+        if law.tangential_restitution is not None:
+            e_t = law.tangential_restitution
     return e, jnp.where(strikes, e_t, 0.0)
 
 
 def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
     """Impulses p and velocity v' of the step, of the problem at the head of this file.
 
-    Equation: `gamma' = D^T v + h D^T a + W p`, with the acceleration a at the mean velocity: it is
-    iterated. If the impulses add energy, `offset_for_mean` is taken from then on.
+    Equation: `gamma' = D^T v + h D^T a + W p`, with the acceleration a at the mean
+    velocity: it is iterated. If the impulses add energy, `offset_for_mean` is taken
+    from then on.
     """
-    system, h, contacts, v0 = problem.system, problem.h, setup.contacts, progress.state.v
+    system = problem.system
+    h = problem.h
+    contacts = setup.contacts
+    v0 = progress.state.v
     constant = system.force is None and not callable(system.mass)
-    least = 1 if constant and system.body.coordinates is None else MEAN
+    if constant and system.body.coordinates is None:
+        least = 1
+    else:
+        least = MEAN
 
     def iteration(last: _Trial) -> _Trial:
-        """Solution of the step with the loads at the mean velocity of the `last` trial."""
+        """Solution of the step with the loads at the mean velocity of the `last`
+        trial.
+        """
         force, free = _loads(system, setup.q, last.mean, setup.middle, setup.mass)
         with_loads = setup.rates + h * contacts.rates(free)  # D^T v + h D^T a
-        right_side = with_loads + jnp.where(last.tries < least, setup.offset, setup.offset_for_mean)
+        right_side = with_loads + jnp.where(
+            last.tries < least, setup.offset, setup.offset_for_mean
+        )
         solution = solve_many(
             contacts.product,
             contacts.diagonal,
@@ -384,11 +461,15 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         v = v0 + h * free + contacts.velocity_change(setup.law_impulse + x)
         after = with_loads + contacts.product(x)  # gamma' and slips
         energy = 0.5 * jnp.vdot(x, setup.rates + after)
-        adds_energy = energy > (setup.noise + solution.residual_velocity) * jnp.sum(jnp.abs(x))
+        adds_energy = energy > (setup.noise + solution.residual_velocity) * jnp.sum(
+            jnp.abs(x)
+        )
         return _Trial(v, 0.5 * (v0 + v), force, solution, adds_energy, last.tries + 1)
 
     def goes_on(trial: _Trial) -> Bool[Array, ""]:
-        """True before `least` tries, then while energy is added, up to twice as many."""
+        """True before `least` tries, then while energy is added, up to twice as
+        many.
+        """
         return (trial.tries < least) | (trial.adds_energy & (trial.tries < 2 * least))
 
     zero = 0 * setup.speed
@@ -408,10 +489,13 @@ def _end_state(
 ) -> tuple[State, Float[Array, "2 m"]]:
     """State at the end of the step, and the energy [J] that each contact gave.
 
-    Equation: `q' = q_m + h v' / 2`; works at the mean velocity u, `h F . u` of the force, `p . D^T
-    (u - B y_b')` of contacts (normal, tangential), `D p . B y_b'` of the base.
+    Equation: `q' = q_m + h v' / 2`; works at the mean velocity u, `h F . u` of the
+    force, `p . D^T (u - B y_b')` of contacts (normal, tangential), `D p . B y_b'` of
+    the base.
     """
-    h, state, contacts = problem.h, progress.state, setup.contacts
+    h = problem.h
+    state = progress.state
+    contacts = setup.contacts
     x = setup.law_impulse + trial.solution.impulse
     work = x * contacts.rates(trial.mean - setup.base_velocity)
     energy = jnp.stack([work[:, 0], jnp.sum(work[:, 1:], axis=1)])
@@ -420,22 +504,30 @@ def _end_state(
         v=trial.v,
         t=setup.end,
         work=state.work + h * trial.force @ trial.mean,
-        base_work=state.base_work + contacts.generalized_impulse(x) @ setup.base_velocity,
+        base_work=state.base_work
+        + contacts.generalized_impulse(x) @ setup.base_velocity,
         contact_work=state.contact_work + contacts.recorded(energy),
     )
     return new, energy
 
 
 def _status(
-    problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial, state: State
+    problem: _StepProblem,
+    progress: _Progress,
+    setup: _Setup,
+    trial: _Trial,
+    state: State,
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Status code after the step, and the code that is reported without ending the motion.
+    """Status code after the step, and the code that is reported without ending the
+    motion.
 
-    The latter is `coarse_step` where a hard impact follows within APART steps of another one, or
-    bodies have passed each other, or in a pile a body moves farther than the reach of its list of
-    neighbours; `unsolved_step` where the solver leaves a misfit above OFF.
+    The latter is `coarse_step` where a hard impact follows within APART steps of
+    another one, or bodies have passed each other, or in a pile a body moves farther
+    than the reach of its list of neighbours; `unsolved_step` where the solver leaves a
+    misfit above OFF.
     """
-    system, contacts = problem.system, setup.contacts
+    system = problem.system
+    contacts = setup.contacts
     fails = jnp.asarray(FAILS)[setup.law_status]
     status = jnp.where(fails, CODE["law_failed"], progress.status)
     status = jnp.where(out_of_range(system, state), CODE["out_of_range"], status)
@@ -458,7 +550,8 @@ def _status(
         rate = contacts.normals.T @ relative
         struck_again = setup.strikes & (progress.steps_since_impact < APART)
         struck_again &= rate < -HARD * setup.speed
-        # a gap that was to close grows: bodies passed each other between two evaluations of it
+        # a gap that was to close grows: bodies passed each other between two
+        # evaluations of it
         speeds = jnp.abs(contacts.normals).T @ jnp.abs(relative)
         turned = rate - progress.closing > TURN * speeds + setup.slow
         coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
@@ -468,9 +561,16 @@ def _status(
     return status.astype(jnp.int32), reported.astype(jnp.int32)
 
 
-def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> Float[Array, " m"]:
-    """Rates [m/s] of gaps that close before the middle of the first step, 0 elsewhere."""
-    system, q, v, t = problem.system, begin.q, begin.v, begin.t
+def _closing_at_start(
+    problem: _StepProblem, begin: State, contacts: int
+) -> Float[Array, " m"]:
+    """Rates [m/s] of gaps that close before the middle of the first step, 0
+    elsewhere.
+    """
+    system = problem.system
+    q = begin.q
+    v = begin.v
+    t = begin.t
     if is_pile(system):
         return jnp.zeros(contacts, q.dtype)
 
@@ -485,7 +585,9 @@ def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> Flo
 def _closing_after(
     problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial
 ) -> Float[Array, " m"]:
-    """Rates [m/s] of gaps that close before the middle of the next step, 0 elsewhere."""
+    """Rates [m/s] of gaps that close before the middle of the next step, 0
+    elsewhere.
+    """
     contacts = setup.contacts
     if isinstance(contacts, ActiveContacts):
         return progress.closing
@@ -504,10 +606,18 @@ def _closing(
 
 
 def _recorded_impact(
-    problem: _StepProblem, events: Events, setup: _Setup, trial: _Trial, energy: Float[Array, "2 m"]
+    problem: _StepProblem,
+    events: Events,
+    setup: _Setup,
+    trial: _Trial,
+    energy: Float[Array, "2 m"],
 ) -> Events:
-    """Events with one row more where a contact strikes in this step; a pile records none."""
-    contacts, x, after = setup.contacts, setup.law_impulse, trial.v
+    """Events with one row more where a contact strikes in this step; a pile records
+    none.
+    """
+    contacts = setup.contacts
+    x = setup.law_impulse
+    after = trial.v
     if isinstance(contacts, ActiveContacts):
         return events
     if problem.joint:
@@ -536,16 +646,18 @@ def _offsets(
     rates: Float[Array, "m b"],
     added: Float[Array, " m"],
 ) -> tuple[Float[Array, "m b"], Float[Array, "m b"]]:
-    """Offsets w of `0 <= p _|_ gamma' + w >= 0`, for friction at the end and at the mean slip.
+    """Offsets w of `0 <= p _|_ gamma' + w >= 0`, for friction at the end and at the
+    mean slip.
 
-    Equation: `w_n = e (gamma + added) - added` where gamma < 0, else gamma; `w_t = e_t u` for
-    friction against the slip at the end, `w_t = u` for the mean slip.
+    Equation: `w_n = e (gamma + added) - added` where gamma < 0, else gamma;
+    `w_t = e_t u` for friction against the slip at the end, `w_t = u` for the mean slip.
 
     Args:
         e: coefficient () or (m,) of normal restitution.
         e_t: that of tangential restitution, 0 where no contact strikes.
         rates: gap velocities gamma and slips u [m/s] without the forces of the step.
-        added: gap velocity [m/s] that the forces add before the impact, 0 where there is none.
+        added: gap velocity [m/s] that the forces add before the impact, 0 where there
+            is none.
 
     Where `w >= rates`, as always in normal direction, impulses add no energy.
     """
@@ -559,9 +671,15 @@ def _offsets(
 
 
 def _law_impulses(
-    law: Law, scene: Scene, v: Float[Array, " n"], noise: Float[Array, ""], shape: tuple[int, ...]
+    law: Law,
+    scene: Scene,
+    v: Float[Array, " n"],
+    noise: Float[Array, ""],
+    shape: tuple[int, ...],
 ) -> tuple[Float[Array, "m b"], Int[Array, ""]]:
-    """Impulses [N s] of the law at each contact, normal then tangential, and its status."""
+    """Impulses [N s] of the law at each contact, normal then tangential, and its
+    status.
+    """
     out: Any = impact(law, scene, v, noise)
     x = out.impulse[:, None]
     if shape[1] > 1:

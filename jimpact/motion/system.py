@@ -27,36 +27,41 @@ DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
 class System(eqx.Module):
     """A body and the loads that move it between impacts; a pytree if its functions are.
 
-    Equation: `M(q) q'' = F(q, q', t) - grad V(q) - (Coriolis terms) + N lambda_n + H lambda_t`
-    with `N = grad f(q_r)`, `H = grad h(q_r)`, `q_r = q - B y_b(t)` the position seen from the base.
+    Equation: `M(q) q'' = F(q, q', t) - grad V(q) - (Coriolis terms) + N lambda_n + H
+    lambda_t` with `N = grad f(q_r)`, `H = grad h(q_r)`, `q_r = q - B y_b(t)` the
+    position seen from the base.
 
     Args:
-        gap_function: a `Body`, which has its own mass and tangents; or q_r (n,) -> gaps f (m,)
-            [m], written with jax.numpy.
+        gap_function: a `Body`, which has its own mass and tangents; or q_r (n,) -> gaps
+            f (m,) [m], written with jax.numpy.
         mass: M: (n,), (n, n), or a function q -> M(q); its Coriolis terms follow by
             differentiation of `T = v^T M(q) v / 2`.
-        force: (q, v, t) -> generalized forces (n,); None: none. They do work on v: of a body in
-            space v has its angular velocity in the axes of the body, and so are its moments.
+        force: (q, v, t) -> generalized forces (n,); None: none. They do work on v: of a
+            body in space v has its angular velocity in the axes of the body, and so are
+            its moments.
         potential: q -> V () [J], its forces are `-grad V`; None: 0.
-        gravity: True: the body has a weight; or its acceleration g >= 0 [m/s^2], downwards. For
-            functions, see `gravity`.
-        tangent_function: q_r -> tangential displacements h (m,) [m] of the contacts (planar);
-            their gradients are the tangents. None: no friction possible.
+        gravity: True: the body has a weight; or its acceleration g >= 0 [m/s^2],
+            downwards. For functions, see `gravity`.
+        tangent_function: q_r -> tangential displacements h (m,) [m] of the contacts
+            (planar); their gradients are the tangents. None: no friction possible.
         base: t -> displacement y_b (d,) [m] of a moving base, written with jax.numpy.
-        base_directions: B (n, d): how q changes when everything moves with the base; None: those
-            of the body.
-        friction: coefficient mu >= 0 of persistent contacts, scalar or (m,), where there are
-            tangents, in the plane or in space; None: that of the law, if it has a field `friction`.
+        base_directions: B (n, d): how q changes when everything moves with the base;
+            None: those of the body.
+        friction: coefficient mu >= 0 of persistent contacts, scalar or (m,), where
+            there are tangents, in the plane or in space; None: that of the law, if it
+            has a field `friction`.
 
-    Functions that are `equinox.Module`s may hold arrays, and `simulate` is differentiable in these.
-    JAX compiles again for each new lambda.
+    Functions that are `equinox.Module`s may hold arrays, and `simulate` is
+    differentiable in these. JAX compiles again for each new lambda.
 
     Raises:
-        ValueError: a mass that is not positive definite, a base without its directions, a potential
-            besides gravity. TypeError: gravity of functions.
+        ValueError: a mass that is not positive definite, a base without its directions,
+            a potential besides gravity. TypeError: gravity of functions.
 
     >>> import jax.numpy as jnp, jimpact as ji
-    >>> ball = ji.System(lambda q: q[1:] - 0.5, [2.0, 2.0], potential=ji.gravity([0.0, 2.0]))
+    >>> ball = ji.System(
+    ...     lambda q: q[1:] - 0.5, [2.0, 2.0], potential=ji.gravity([0.0, 2.0])
+    ... )
     >>> float(ball.potential(jnp.array([0.0, 1.0])))
     19.6133
     >>> block = ji.Block(width=0.2, height=0.6)
@@ -105,13 +110,18 @@ class System(eqx.Module):
         gravity: Any = False,
         friction: Any = None,
     ):
-        for name, function in {"force": force, "potential": potential, "base": base}.items():
+        for name, function in {
+            "force": force,
+            "potential": potential,
+            "base": base,
+        }.items():
             if function is not None:
                 check_function(name, function)
         if not isinstance(gap_function, Body):
             if mass is None and callable(gap_function):
                 raise ValueError(
-                    "Argument `mass` must be given where `gap_function` is a function (a body has "
+                    "Argument `mass` must be given where `gap_function` is a function "
+                    "(a body has "
                     "its own): an array or a function q -> M(q), but is None."
                 )
             self.body = FunctionBody(gap_function, mass, tangent_function)
@@ -119,21 +129,30 @@ class System(eqx.Module):
             self.body = gap_function
         else:
             raise ValueError(
-                "Arguments `mass` and `tangent_function` must not be given with a body, which has "
+                "Arguments `mass` and `tangent_function` must not be given with a "
+                "body, which has "
                 "its own."
             )
         if gravity is not False:
             if potential is not None:
-                raise ValueError("Argument `potential` must not be given besides `gravity`.")
+                raise ValueError(
+                    "Argument `potential` must not be given besides `gravity`."
+                )
             potential = self.body.gravity(_acceleration_of(gravity))
-        self.force, self.potential, self.base = force, potential, base
-        self.friction = None if friction is None else as_float_array("friction", friction)
+        self.force = force
+        self.potential = potential
+        self.base = base
+        if friction is None:
+            self.friction = None
+        else:
+            self.friction = as_float_array("friction", friction)
         check_values("friction", self.friction, low=0.0)
         if base is not None and base_directions is None:
             base_directions = self.body.base_directions
         if (base is None) != (base_directions is None):
             raise ValueError(
-                "Argument `base_directions` must be given with `base`, and only with it."
+                "Argument `base_directions` must be given with `base`, and only with "
+                "it."
             )
         self.base_directions = None
         if base_directions is not None:
@@ -162,8 +181,12 @@ class System(eqx.Module):
 
 
 def _acceleration_of(gravity: Any) -> Float[Array, ""]:
-    """Size >= 0 [m/s^2] of an acceleration that points downwards; True: the standard one."""
-    acceleration = as_float_array("gravity", STANDARD_GRAVITY if gravity is True else gravity)
+    """Size >= 0 [m/s^2] of an acceleration that points downwards; True: the standard
+    one.
+    """
+    acceleration = as_float_array(
+        "gravity", STANDARD_GRAVITY if gravity is True else gravity
+    )
     check_shape("gravity", acceleration, (), "the size of the acceleration")
     if not is_traced(acceleration) and float(acceleration) < 0:
         raise ValueError(
@@ -180,8 +203,8 @@ def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> Potenti
     Equation: `V = g sum_i m_i q_i`.
 
     Args:
-        mass_along_up: a `Body`; or (n,): the mass that each coordinate lifts [kg], 0 for
-            horizontal ones and angles, negative where the coordinate points down.
+        mass_along_up: a `Body`; or (n,): the mass that each coordinate lifts [kg], 0
+            for horizontal ones and angles, negative where the coordinate points down.
         acceleration: g [m/s^2].
 
     Returns:
@@ -193,7 +216,9 @@ def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> Potenti
     >>> import jimpact as ji
     >>> ji.gravity([0.0, 2.0], acceleration=10.0).weights.tolist()
     [0.0, 20.0]
-    >>> ji.gravity(ji.Block(width=0.2, height=0.6, mass=2.0), acceleration=10.0).weights.tolist()
+    >>> ji.gravity(
+    ...     ji.Block(width=0.2, height=0.6, mass=2.0), acceleration=10.0
+    ... ).weights.tolist()
     [0.0, 20.0, 0.0]
     """
     check_values("acceleration", acceleration)
@@ -227,7 +252,9 @@ class HarmonicBase(eqx.Module):
     phase: Float[Array, "..."]
     direction: str = eqx.field(static=True)
 
-    def __init__(self, amplitude: Any, frequency: Any, phase: Any = 0.0, direction: str = "line"):
+    def __init__(
+        self, amplitude: Any, frequency: Any, phase: Any = 0.0, direction: str = "line"
+    ):
         self.amplitude = as_float_array("amplitude", amplitude)
         self.frequency = as_float_array("frequency", frequency)
         self.phase = as_float_array("phase", phase)
@@ -235,7 +262,8 @@ class HarmonicBase(eqx.Module):
             check_values(name, getattr(self, name))
         if direction not in DIRECTIONS:
             raise ValueError(
-                f"Argument `direction` must be one of {DIRECTIONS}, but has value {direction!r}."
+                f"Argument `direction` must be one of {DIRECTIONS}, but has value "
+                f"{direction!r}."
             )
         self.direction = direction
 
@@ -244,20 +272,27 @@ class HarmonicBase(eqx.Module):
         y = self.amplitude * jnp.sin(2 * jnp.pi * self.frequency * t + self.phase)
         if self.direction == "line":
             return y[None]
-        pair = (0 * y, y) if self.direction == "vertical" else (y, 0 * y)
+        if self.direction == "vertical":
+            pair = (0 * y, y)
+        else:
+            pair = (y, 0 * y)
         return jnp.stack(pair)
 
 
 def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
-    """Raise where a function of the system cannot be called, or returns another shape or type.
+    """Raise where a function of the system cannot be called, or returns another shape
+    or type.
 
     At (q, v, t), traced in the precision of q; nothing is computed.
     """
-    body, n, precision = system.body, v.shape[0], q.dtype
+    body = system.body
+    n = v.shape[0]
+    precision = q.dtype
     mass = _shape_of("mass", body.mass_matrix, {"q": q}, precision)
     if mass not in ((n,), (n, n)):
         raise ValueError(
-            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` "
+            f"has {n} "
             f"velocities, but has one of shape {mass}."
         )
     f = _shape_of("gap_function", body.gap_function, {"q": q}, precision)
@@ -265,7 +300,9 @@ def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
     _check_returned("gap_function", f, "(m,), a gap for each of m >= 1 contacts", fits)
     h = _shape_of("tangent_function", body.tangent_function, {"q": q}, precision)
     if h is not None:
-        _check_returned("tangent_function", h, "(m,), one displacement a contact", len(h) == 1)
+        _check_returned(
+            "tangent_function", h, "(m,), one displacement a contact", len(h) == 1
+        )
     if system.force is not None:
         force = _shape_of("force", system.force, {"q": q, "v": v, "t": t}, precision)
         _check_returned("force", force, f"({n},), one per velocity", force == (n,))
@@ -275,29 +312,39 @@ def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
     if system.base is not None:
         assert system.base_directions is not None
         d = system.base_directions.shape[1]
-        check_shape("base_directions", system.base_directions, (n, d), "a row for each velocity")
+        check_shape(
+            "base_directions", system.base_directions, (n, d), "a row for each velocity"
+        )
         place = _shape_of("base", system.base, {"t": t}, precision)
         fits = place == (d,) or (place == () and d == 1)
-        _check_returned("base", place, f"({d},), as `base_directions` has {d} columns", fits)
+        _check_returned(
+            "base", place, f"({d},), as `base_directions` has {d} columns", fits
+        )
 
 
-def _shape_of(name: str, function: Any, values: dict[str, jax.Array], precision: Any) -> Any:
-    """Shape that a function returns for traced `values` of its arguments; None where that is None.
+def _shape_of(
+    name: str, function: Any, values: dict[str, jax.Array], precision: Any
+) -> Any:
+    """Shape that a function returns for traced `values` of its arguments; None where
+    that is None.
 
-    Raises a TypeError where it cannot be traced, returns whole numbers to be differentiated, or a
-    finer precision.
+    Raises a TypeError where it cannot be traced, returns whole numbers to be
+    differentiated, or a finer precision.
     """
 
     def call(*traced: jax.Array) -> jax.Array | None:
         out = function(*traced)
-        return None if out is None else jnp.asarray(out)
+        if out is None:
+            return None
+        return jnp.asarray(out)
 
     try:
         out = jax.eval_shape(call, *values.values())
     except Exception as error:
         reason = next(iter(str(error).splitlines()), "")
         raise TypeError(
-            f"Argument `system` must have a `{name}` that takes JAX arrays ({', '.join(values)}) "
+            f"Argument `system` must have a `{name}` that takes JAX arrays "
+            f"({', '.join(values)}) "
             f"and returns one, but it raises {type(error).__name__}: {reason}"
         ) from error
     if out is None:
@@ -305,12 +352,14 @@ def _shape_of(name: str, function: Any, values: dict[str, jax.Array], precision:
     whole = not jnp.issubdtype(out.dtype, jnp.floating)
     if whole and name in DIFFERENTIATED:
         raise TypeError(
-            f"Argument `system` must have a `{name}` that returns floating numbers, but it "
+            f"Argument `system` must have a `{name}` that returns floating numbers, "
+            f"but it "
             f"returns {out.dtype}."
         )
     if not whole and jnp.finfo(out.dtype).bits > jnp.finfo(precision).bits:
         raise TypeError(
-            f"Argument `system` must compute in the precision of `q0`, {precision}, but its "
+            f"Argument `system` must compute in the precision of `q0`, {precision}, "
+            f"but its "
             f"`{name}` returns {out.dtype}: give `q0` in it, too."
         )
     return out.shape

@@ -1,7 +1,7 @@
 """The data of a motion, the table that a run fills, and the derivatives of that.
 
-JAX pushes tangents through the loop of a run: all that is decided (lengths of steps, events, modes)
-has none. Both modes then follow from its Jacobian (`derive.py`).
+JAX pushes tangents through the loop of a run: all that is decided (lengths of steps,
+events, modes) has none. Both modes then follow from its Jacobian (`derive.py`).
 """
 
 from collections.abc import Callable
@@ -21,8 +21,8 @@ from jimpact.motion.transitions import After, tangent_count_of
 from jimpact.numerics.derive import by_jacobian
 from jimpact.numerics.stepper import put
 
-# Power of the largest number that makes tangents of 1e-31 (float32) infinite the second time, but
-# none below 1e3 the first time.
+# Power of the largest number that makes tangents of 1e-31 (float32) infinite the second
+# time, but none below 1e3 the first time.
 LARGE = 0.9
 
 
@@ -60,7 +60,9 @@ class MotionProblem(NamedTuple):
 
 
 class Course(NamedTuple):
-    """A whole motion: states at the sampled times (NaN: not reached), events, steps, status."""
+    """A whole motion: states at the sampled times (NaN: not reached), events, steps,
+    status.
+    """
 
     samples: State  # of arrays with a first axis S
     events: Events
@@ -69,7 +71,8 @@ class Course(NamedTuple):
 
 
 class MotionTable(NamedTuple):
-    """Rows of samples and events that a run fills; rows beyond those reached hold anything.
+    """Rows of samples and events that a run fills; rows beyond those reached hold
+    anything.
 
     The last row of each takes what is discarded, as every pass writes one.
     """
@@ -79,11 +82,16 @@ class MotionTable(NamedTuple):
     marks: Int[Array, "E+1 2+m"]  # kind, status of the law, contacts that take part
 
     def with_event(
-        self, numbers: Float[Array, " w"], marks: Int[Array, " marks"], row: Int[Array, ""]
+        self,
+        numbers: Float[Array, " w"],
+        marks: Int[Array, " marks"],
+        row: Int[Array, ""],
     ) -> "MotionTable":
         """The table with an event in this row; see `event_numbers` and `marks`."""
         events = put(self.events, numbers, row)
-        return self._replace(events=events, marks=put(self.marks, marks.astype(jnp.int32), row))
+        return self._replace(
+            events=events, marks=put(self.marks, marks.astype(jnp.int32), row)
+        )
 
     def with_sample(self, state: State, row: Int[Array, ""]) -> "MotionTable":
         """The table with this state as the sample of this row."""
@@ -105,26 +113,29 @@ class MotionEnd(NamedTuple):
 def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
     """`run(problem)` with derivatives in both modes, of its samples and events.
 
-    They are NaN in rows that the motion does not reach, or that come after a normal has jumped.
+    They are NaN in rows that the motion does not reach, or that come after a normal has
+    jumped.
     """
     end: MotionEnd = by_jacobian(run, problem)
 
     def known(rows: Float[Array, "r w"], count: Int[Array, ""]) -> Float[Array, "r w"]:
-        """Rows, of which the first `count` and the last one have derivatives, others NaN."""
+        """Rows, of which the first `count` and the last one have derivatives, others
+        NaN.
+        """
         index = jnp.arange(len(rows), dtype=count.dtype)
         there = (index < count) | (index == len(rows) - 1)
         some = jnp.where(there[:, None], rows, jax.lax.stop_gradient(rows))
         return some + nan_derivatives(problem, there).astype(rows.dtype)
 
-    samples, events = (
-        known(end.table.samples, jnp.minimum(end.reached, end.smooth[0])),
-        known(end.table.events, jnp.minimum(end.event_count, end.smooth[1])),
-    )
+    samples = known(end.table.samples, jnp.minimum(end.reached, end.smooth[0]))
+    events = known(end.table.events, jnp.minimum(end.event_count, end.smooth[1]))
     return end._replace(table=MotionTable(samples, events, end.table.marks))
 
 
 def empty_table(problem: MotionProblem, start: State, max_events: int) -> MotionTable:
-    """Table of a motion that begins in this state, its first sample; other rows are 0."""
+    """Table of a motion that begins in this state, its first sample; other rows are
+    0.
+    """
     return MotionTable(
         no_samples(start, problem.times),
         jnp.zeros((max_events + 1, event_width(problem)), start.q.dtype),
@@ -133,12 +144,16 @@ def empty_table(problem: MotionProblem, start: State, max_events: int) -> Motion
 
 
 def no_samples(start: State, targets: Float[Array, " S"]) -> Float[Array, "S+1 rows"]:
-    """Rows of the states at the samples, of which the first is known; the last is for discards."""
+    """Rows of the states at the samples, of which the first is known; the last is for
+    discards.
+    """
     row = packed(start)[:, 0]
     return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
 
 
-def nan_unless(known: Bool[Array, " r"], rows: Float[Array, "r w"]) -> Float[Array, "r w"]:
+def nan_unless(
+    known: Bool[Array, " r"], rows: Float[Array, "r w"]
+) -> Float[Array, "r w"]:
     """Rows, NaN where not `known`; unlike with `jnp.where`, all derivatives pass."""
     return rows + jnp.where(known, 0.0, jnp.nan).astype(rows.dtype)[:, None]
 
@@ -146,8 +161,8 @@ def nan_unless(known: Bool[Array, " r"], rows: Float[Array, "r w"]) -> Float[Arr
 def nan_derivatives(inputs: Any, known: Bool[Array, " r"]) -> Float[Array, "r 1"]:
     """Zeros; where not `known` all their derivatives by all inputs are NaN.
 
-    A motion that has ended does not determine what would come later. In reverse mode what nobody
-    differentiates (a cotangent of 0) leaves the gradient as it is.
+    A motion that has ended does not determine what would come later. In reverse mode
+    what nobody differentiates (a cotangent of 0) leaves the gradient as it is.
     """
     arrays = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
     return _undetermined(arrays, ~known)[:, None]
@@ -166,18 +181,22 @@ def _undetermined(
 
 @_undetermined.defjvp
 def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Zeros and their tangents: large numbers times the cosine of all inputs, where unknown.
+    """Zeros and their tangents: large numbers times the cosine of all inputs, where
+    unknown.
 
-    Equation: `d = L w_i cos(1 + sum_j w_j x_j) sum_j L dx_j`, L of `_enlarged`: infinite or NaN
-    unless all dx_j are 0, as are its own derivatives.
+    Equation: `d = L w_i cos(1 + sum_j w_j x_j) sum_j L dx_j`, L of `_enlarged`:
+    infinite or NaN unless all dx_j are 0, as are its own derivatives.
     """
     arrays, unknown = primals
     flat = jnp.concatenate([jnp.where(jnp.isfinite(x), x, 0.0).ravel() for x in arrays])
     flat = _reversed(flat)  # and an infinite cotangent becomes NaN
     slope = jnp.cos(1 + flat @ _weights(flat.size))
     some = jnp.any(unknown)
-    # large, not yet NaN, on either side of the slope: its own derivative may be multiplied by 0
-    total = sum(jnp.sum(_enlarged(slope * _enlarged(x, some), some)) for x in tangents[0])
+    # large, not yet NaN, on either side of the slope: its own derivative may be
+    # multiplied by 0
+    total = sum(
+        jnp.sum(_enlarged(slope * _enlarged(x, some), some)) for x in tangents[0]
+    )
     each = jnp.where(unknown, total * _weights(unknown.size), 0.0)
     return jnp.where(unknown, 0.0, 0.0), each.astype(float)
 
@@ -189,7 +208,9 @@ def _weights(count: int) -> np.ndarray:
 
 def _enlarged(x: Float[Array, "*d"], chosen: Bool[Array, ""]) -> Float[Array, "*d"]:
     """`L x` where `chosen`, L = max^LARGE: the second time gives infinity, then NaN."""
-    factor = jnp.where(chosen, float(jnp.finfo(x.dtype).max) ** LARGE, 1.0).astype(x.dtype)
+    factor = jnp.where(chosen, float(jnp.finfo(x.dtype).max) ** LARGE, 1.0).astype(
+        x.dtype
+    )
     return _reversed(factor * _reversed(x))  # and so is its transpose
 
 
@@ -201,7 +222,9 @@ def _reversed(x: Float[Array, "*d"]) -> Float[Array, "*d"]:
 def sampled_states(
     samples: Float[Array, "table rows"], like: State, reached: Int[Array, ""]
 ) -> State:
-    """States (S, ..) from S + 1 rows, NaN beyond the first `reached`; `like` has their shapes."""
+    """States (S, ..) from S + 1 rows, NaN beyond the first `reached`; `like` has their
+    shapes.
+    """
     is_reached = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
     rows = nan_unless(is_reached, samples[:-1])
     return jax.vmap(lambda row: unpacked(like, row[:, None]))(rows)
@@ -209,24 +232,47 @@ def sampled_states(
 
 def event_width(problem: MotionProblem) -> int:
     """Count of the numbers of `event_numbers`: 3 + nq + 2 n + 3 m + t."""
-    return 3 + problem.q0.size + 2 * problem.v0.size + 3 * problem.contacts + problem.tangents
+    return (
+        3
+        + problem.q0.size
+        + 2 * problem.v0.size
+        + 3 * problem.contacts
+        + problem.tangents
+    )
 
 
 def event_numbers(before: State, after: After) -> Float[Array, " w"]:
-    """Row of an event: t, q, v-, v+, impulses (m, then t), energies (2 m), time and gap passed."""
+    """Row of an event: t, q, v-, v+, impulses (m, then t), energies (2 m), time and gap
+    passed.
+    """
     jump = after.jump
-    parts = (before.t, before.q, before.v, jump.v, jump.impulse, jump.tangential, jump.energy)
+    parts = (
+        before.t,
+        before.q,
+        before.v,
+        jump.v,
+        jump.impulse,
+        jump.tangential,
+        jump.energy,
+    )
     return ravel_pytree((parts, after.passed))[0]
 
 
-def recorded_events(table: MotionTable, count: Int[Array, ""], problem: MotionProblem) -> Events:
-    """Record of the first `count` events of a table; NaN or 0 in rows that are not used."""
+def recorded_events(
+    table: MotionTable, count: Int[Array, ""], problem: MotionProblem
+) -> Events:
+    """Record of the first `count` events of a table; NaN or 0 in rows that are not
+    used.
+    """
     used = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
     rows = nan_unless(used, table.events[:-1])
-    n, m = problem.v0.size, problem.contacts
+    n = problem.v0.size
+    m = problem.contacts
     sizes = np.cumsum([1, problem.q0.size, n, n, m, problem.tangents, 2 * m])
-    time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
+    time, q, before, after, impulse, side, energy, passed = jnp.split(
+        rows, sizes, axis=1
+    )
     ends = marks[:, 0] == KIND_CODE["accumulation"]
     return Events(
         count=count,

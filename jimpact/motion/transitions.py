@@ -1,9 +1,10 @@
-"""Events of rigid contacts: the impact, the end of an accumulation, new modes of contact.
+"""Events of rigid contacts: the impact, the end of an accumulation, new modes of
+contact.
 
-*Fired* are the margins that a step has brought to 0: m of gaps or normal forces, with friction m
-more of the cone or the slip. An *accumulation* is an infinite sequence of impacts in finite time.
-An *impact without collision* (`paroxysm`) is that of contacts which friction jams: no contact
-forces exist, although no contact approaches.
+*Fired* are the margins that a step has brought to 0: m of gaps or normal forces, with
+friction m more of the cone or the slip. An *accumulation* is an infinite sequence of
+impacts in finite time. An *impact without collision* (`paroxysm`) is that of contacts
+which friction jams: no contact forces exist, although no contact approaches.
 """
 
 from typing import NamedTuple
@@ -42,24 +43,28 @@ from jimpact.motion.system import System
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE, STATUS
 
-# A contact that still approaches is no failure: it has another impact at the same instant.
+# A contact that still approaches is no failure: it has another impact at the same
+# instant.
 FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STATUS)
 # Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
 LEAST_COUPLING = 1e-9  # |W_ij| / sqrt(W_ii W_jj) of two contacts: less is rounding
-# An impact without collision is that of contacts that approach at the root of rounding, of the
-# slip: it errs by about as much. MORE times what is left of `regularity` is added to this, or
-# contacts would part before they are wedged.
+# An impact without collision is that of contacts that approach at the root of rounding,
+# of the slip: it errs by about as much. MORE times what is left of `regularity` is
+# added to this, or contacts would part before they are wedged.
 MORE = 10.0
 # Slips that change by less than SUPPLIED approaches change by what any impact does.
 SUPPLIED = 100.0
-# Of the speed scale of the motion: slip in space below it has stopped where a step landed on its
-# end. Ten times more: slip that turns round as slowly as this is taken to stop.
+# Of the speed scale of the motion: slip in space below it has stopped where a step
+# landed on its end. Ten times more: slip that turns round as slowly as this is taken to
+# stop.
 STOPPED = 1e-7
 
 
 class Jump(NamedTuple):
-    """Velocities after an event, and the impulses, energies and status that belong to them."""
+    """Velocities after an event, and the impulses, energies and status that belong to
+    them.
+    """
 
     v: Float[Array, " n"]
     impulse: Float[Array, " m"]  # [N s] normal
@@ -70,7 +75,9 @@ class Jump(NamedTuple):
 
 
 def no_jump(state: State, m: int, tangents: int) -> Jump:
-    """Jump with the velocities of the state and impulses 0, m normal and `tangents` others."""
+    """Jump with the velocities of the state and impulses 0, m normal and `tangents`
+    others.
+    """
     dtype = state.v.dtype
     return Jump(
         v=state.v,
@@ -83,9 +90,14 @@ def no_jump(state: State, m: int, tangents: int) -> Jump:
 
 
 def scene_at(
-    system: System, q: Float[Array, " nq"], t: Float[Array, ""], closed: Bool[Array, " m"]
+    system: System,
+    q: Float[Array, " nq"],
+    t: Float[Array, ""],
+    closed: Bool[Array, " m"],
 ) -> Scene:
-    """Scene of an impact at q: mass, normals, tangents; gap 0 of closed contacts, inf of others."""
+    """Scene of an impact at q: mass, normals, tangents; gap 0 of closed contacts, inf
+    of others.
+    """
     _, normals, tangents = system.body.directions(seen_from_base(system, q, t))
     away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
     return Scene(mass_at(system, q), normals, tangents, away)
@@ -102,9 +114,9 @@ def impact_jump(
 ) -> Jump:
     """Jump by `impact` in the frame of the base: v is seen as `v - B y_b'`.
 
-    Equation: a contact gives `p N^T (v- + v+) / 2` [J], tangentially `p_t . H^T (v- + v+) / 2`, the
-    base `(N p + H p_t) . B y_b'`. Gap velocities up to `noise` [m/s] are rounding; `approach`: see
-    `impact`.
+    Equation: a contact gives `p N^T (v- + v+) / 2` [J], tangentially
+    `p_t . H^T (v- + v+) / 2`, the base `(N p + H p_t) . B y_b'`. Gap velocities up to
+    `noise` [m/s] are rounding; `approach`: see `impact`.
     """
     m = closed.shape[0]
     scene = scene_at(system, state.q, t, closed)
@@ -114,23 +126,35 @@ def impact_jump(
     mean = 0.5 * (out.velocity + relative)
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
-    tangential, friction = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
+    tangential = jnp.zeros(m, normal.dtype)
+    friction = jnp.zeros(m, normal.dtype)
     if scene.tangents is not None:
         tangential = out.tangential_impulse
         friction = by_contact((scene.tangents.T @ mean) * tangential, m).sum(axis=1)
         push = push + scene.tangents @ tangential
     energy = jnp.stack([normal, friction])
-    return Jump(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
+    return Jump(
+        out.velocity + carried,
+        out.impulse,
+        tangential,
+        energy,
+        push @ carried,
+        out.status,
+    )
 
 
 def tangent_count_of(system: System, q: Float[Array, " nq"], m: int) -> int:
     """Number t of tangential impulses of m contacts; m for a body without tangents."""
     tangents = jax.eval_shape(system.body.tangents, q)
-    return m if tangents is None else int(tangents.shape[1])
+    if tangents is None:
+        return m
+    return int(tangents.shape[1])
 
 
 class Passed(NamedTuple):
-    """Rest of an accumulation that is passed at once, as estimated; 0 where there is none."""
+    """Rest of an accumulation that is passed at once, as estimated; 0 where there is
+    none.
+    """
 
     time: Float[Array, ""]  # [s] that the impacts left out would take
     gap: Float[Array, ""]  # [m] to which contacts might open within it
@@ -155,7 +179,8 @@ class Outcome(NamedTuple):
     contacts: Bool[Array, " m"]  # that take part
     code: Int[Array, ""]  # status of the law, or that there are several solutions
     status: Int[Array, ""]  # of the motion
-    # [m/s] gap velocity of the impact without collision that must come next, 0 where none must
+    # [m/s] gap velocity of the impact without collision that must come next, 0 where
+    # none must
     approach: Float[Array, ""]
     several: Bool[Array, ""]  # contact forces are not unique
 
@@ -172,7 +197,8 @@ def resolve(
     struck: Bool[Array, " m"],
     approach: Float[Array, ""],
 ) -> Outcome:
-    """Resolve an event: impact if a closed contact approaches; contacts come to rest; new modes.
+    """Resolve an event: impact if a closed contact approaches; contacts come to rest;
+    new modes.
 
     Args:
         before: modes up to now.
@@ -181,22 +207,25 @@ def resolve(
         struck: contacts that had an impact before.
         approach: [m/s] of an impact without collision that is due, else 0.
 
-    A closed contact remains closed if it leaves by no more than rounding, or slower than
-    `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
-    impacts is then passed at once (its gap velocity is set to 0, energy is lost).
+    A closed contact remains closed if it leaves by no more than rounding, or slower
+    than `settings.accumulation` and would be pressed back: the rest of its infinite
+    sequence of impacts is then passed at once (its gap velocity is set to 0, energy is
+    lost).
 
-    Where friction leaves no contact forces, the next event, at the same instant, is an impact
-    without collision: the limit of that of contacts that approach ever more slowly. They do at
-    `approach` here.
+    Where friction leaves no contact forces, the next event, at the same instant, is an
+    impact without collision: the limit of that of contacts that approach ever more
+    slowly. They do at `approach` here.
 
-    Clusters: where contacts share bodies, accumulations are nested: their numbers of impacts
-    multiply. A contact that shares a body with another one that is closed or was `struck` before
-    remains closed below the square root of that share of velocity, which is that share of height.
-    That is done for all of them at once, and only if no other contact is reached within the time
-    that is passed: the state after it is then that at the end of the sequence.
+    Clusters: where contacts share bodies, accumulations are nested: their numbers of
+    impacts multiply. A contact that shares a body with another one that is closed or
+    was `struck` before remains closed below the square root of that share of velocity,
+    which is that share of height. That is done for all of them at once, and only if no
+    other contact is reached within the time that is passed: the state after it is then
+    that at the end of the sequence.
     """
     strike = _impact_if_any(system, law, settings, state, scales, approach)
-    tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)  # f' = 0
+    # f' = 0
+    tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)
     m = before.active.shape[0]
     stopped = jnp.zeros(m, bool)
     if settings.spatial:
@@ -234,22 +263,26 @@ def slip_stops(
     speed: Float[Array, " m"],
     speed_scale: Float[Array, ""],
 ) -> Bool[Array, " m"]:
-    """True where a contact that slid, and whose margin of friction has `fired`, has stopped.
+    """True where a contact that slid, and whose margin of friction has `fired`, has
+    stopped.
 
-    In space only where its slip `speed` [m/s] is at most STOPPED of the scale: a step may turn slip
-    by so much that it lands on `u . d = 0` although slip goes on.
+    In space only where its slip `speed` [m/s] is at most STOPPED of the scale: a step
+    may turn slip by so much that it lands on `u . d = 0` although slip goes on.
     """
     slid = fired & ~before.stick
-    return slid & (speed <= STOPPED * speed_scale) if settings.spatial else slid
+    if settings.spatial:
+        return slid & (speed <= STOPPED * speed_scale)
+    return slid
 
 
 def _fired_in_space(
     settings: Settings, strike: "_Strike", before: Modes, fired: Bool[Array, " f"]
 ) -> tuple[Bool[Array, " f"], Bool[Array, " m"]]:
-    """Margins that have fired (2 m,) without those that are no events, and stopped contacts (m,).
+    """Margins that have fired (2 m,) without those that are no events, and stopped
+    contacts (m,).
 
-    A step may turn slip by so much that it lands although slip goes on, or slip may no longer
-    only begin: these are no events.
+    A step may turn slip by so much that it lands although slip goes on, or slip may no
+    longer only begin: these are no events.
     """
     assert strike.contacts.tangent is not None
     m = before.active.shape[0]
@@ -281,7 +314,8 @@ def _impact_if_any(
     scales: Scales,
     approach: Float[Array, ""],
 ) -> _Strike:
-    """The impact of contacts with f' < -rest at closed gaps, or one without collision if due.
+    """The impact of contacts with f' < -rest at closed gaps, or one without collision
+    if due.
 
     Its jump is empty where neither is so.
     """
@@ -317,13 +351,17 @@ def _brought_slow_to_rest(
     tight: Bool[Array, " m"],
     stopped: Bool[Array, " m"],
 ) -> "_Resting":
-    """Contacts brought to rest: `tight` ones (f' = 0), and slow ones that would be pressed back.
+    """Contacts brought to rest: `tight` ones (f' = 0), and slow ones that would be
+    pressed back.
 
-    Slow: |f'| at most `accumulation` times the largest gap velocity, or a hop within the rounding
-    of gaps. Slip comes to rest, too, where it has `stopped` or is as slow.
+    Slow: |f'| at most `accumulation` times the largest gap velocity, or a hop within
+    the rounding of gaps. Slip comes to rest, too, where it has `stopped` or is as slow.
     """
-    contacts, scales, closed = strike.contacts, strike.scales, strike.closed
-    m, gamma = tight.shape[0], contacts.normal.rate
+    contacts = strike.contacts
+    scales = strike.scales
+    closed = strike.closed
+    m = tight.shape[0]
+    gamma = contacts.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
     # a hop below the rounding of gaps is none: it would strike faster than it left
     least_hop = 2 * scales.acceleration * settings.gap_rounding
@@ -340,7 +378,9 @@ def _brought_slow_to_rest(
         """
         pressed, kept_closed, force = pressed_together(contacts, slow, _slack(strike))
         stopped = tight | (slow & pressed)
-        stop = _brought_to_rest(system, contacts, mu, stopped, stick, strike.t, strike.jump)
+        stop = _brought_to_rest(
+            system, contacts, mu, stopped, stick, strike.t, strike.jump
+        )
         # redundant contacts come to rest with others
         left = gamma + contacts.delassus[:m] @ stop.impulse  # gap velocities after it
         at_rest = closed & (jnp.abs(left) <= strike.rest)
@@ -352,8 +392,15 @@ def _brought_slow_to_rest(
     slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
         return resting(slow)
-    nested = closed & strike.happens & ~strike.jams & _share_bodies(contacts, closed | struck)
-    nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
+    nested = (
+        closed
+        & strike.happens
+        & ~strike.jams
+        & _share_bodies(contacts, closed | struck)
+    )
+    nested = nested & (
+        jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity
+    )
     both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
     alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     undisturbed = _undisturbed(system, contacts, cluster, strike.t)
@@ -361,7 +408,9 @@ def _brought_slow_to_rest(
 
 
 def _slack(strike: _Strike) -> Float[Array, ""]:
-    """Gap acceleration [m/s^2] below which it is rounding: a share of the largest one."""
+    """Gap acceleration [m/s^2] below which it is rounding: a share of the largest
+    one.
+    """
     return rest_acceleration(strike.rest.dtype) * strike.scales.acceleration
 
 
@@ -375,24 +424,32 @@ def _next_modes(
     before: Modes,
     fired: Bool[Array, " f"],
 ) -> tuple[ModeChoice, Bool[Array, " m"], Bool[Array, " f"]]:
-    """Modes after an event, by complementarity of forces and accelerations at resting contacts.
+    """Modes after an event, by complementarity of forces and accelerations at resting
+    contacts.
 
-    Equation: `0 <= lambda_n _|_ a_n >= 0` with `a = W lambda + approach` at `state`; with friction
-    `|lambda_t| <= mu lambda_n`, and equality against the slip, see `choose_with_friction`. Without
-    friction `pressed_together` has solved it; a contact that neither presses nor parts stays closed
-    unless its force has just fallen to 0.
+    Equation: `0 <= lambda_n _|_ a_n >= 0` with `a = W lambda + approach` at `state`;
+    with friction `|lambda_t| <= mu lambda_n`, and equality against the slip, see
+    `choose_with_friction`. Without friction `pressed_together` has solved it; a contact
+    that neither presses nor parts stays closed unless its force has just fallen to 0.
 
-    Returns modes; contacts at rest; constraints (normal, with friction tangential) that the step
-    has `fired` and that held before: they are released.
+    Returns modes; contacts at rest; constraints (normal, with friction tangential) that
+    the step has `fired` and that held before: they are released.
     """
-    contacts, rest = strike.contacts, strike.rest
-    if mu is not None:  # what velocities before the rest would still turn, redundant contacts fight
+    contacts = strike.contacts
+    rest = strike.rest
+    # what velocities before the rest would still turn, redundant contacts fight
+    if mu is not None:
         contacts = contacts_at(system, state.q, state.v, strike.t, True)
     held = result.at_rest
-    held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
+    if not settings.friction:
+        held_before = before.active
+    else:
+        held_before = jnp.tile(before.active, 2)
     released = fired & held_before & ~strike.happens
     if mu is not None:
-        choice = _with_friction(contacts, mu, before, held, released, rest, _slack(strike))
+        choice = _with_friction(
+            contacts, mu, before, held, released, rest, _slack(strike)
+        )
         return choice, held, released
     m = held.shape[0]
     active = result.pressed | (held & result.kept_closed & ~released)
@@ -404,24 +461,31 @@ def _next_modes(
 def _status(
     strike: _Strike, jump: Jump, choice: ModeChoice, held: Bool[Array, " m"]
 ) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
-    """Status of the motion, that of the law, and approach [m/s] of a following paroxysm.
+    """Status of the motion, that of the law, and approach [m/s] of a following
+    paroxysm.
 
-    A paroxysm is an impact without collision: in the plane it is due where the modes are not
-    consistent and a contact at rest (`held`) slips. Where it changed nothing, or none is possible,
-    the status is `no_contact_force`.
+    A paroxysm is an impact without collision: in the plane it is due where the modes
+    are not consistent and a contact at rest (`held`) slips. Where it changed nothing,
+    or none is possible, the status is `no_contact_force`.
     """
     fails = jnp.asarray(FAILS)[jump.code]
     status = jnp.where(fails, CODE["law_failed"], CODE["ok"])
-    code, next_approach = jump.code, jnp.zeros_like(strike.rest)
-    now, earlier = strike.contacts.tangent, strike.before.tangent
+    code = jump.code
+    next_approach = jnp.zeros_like(strike.rest)
+    now = strike.contacts.tangent
+    earlier = strike.before.tangent
     if now is not None and earlier is not None:
         change = jnp.max(jnp.abs(now.rate - earlier.rate))
         if not in_space(strike.contacts):
-            next_approach = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
+            next_approach = jnp.where(
+                choice.consistent, 0.0, _approach(choice, now.rate, held)
+            )
         jammed = strike.jams & (change <= SUPPLIED * strike.approach)
         none = jammed | (~choice.consistent & (next_approach == 0))
         status = jnp.where(none, CODE["no_contact_force"], status)
-        code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
+        code = jnp.where(
+            choice.several, jnp.maximum(code, CODE["several_outcomes"]), code
+        )
     return status, code, next_approach
 
 
@@ -438,7 +502,9 @@ class _Resting(NamedTuple):
 
 
 def _share_bodies(contacts: Contacts, touched: Bool[Array, " m"]) -> Bool[Array, " m"]:
-    """True where a contact i is coupled to a `touched` one j: `|W_ij| > eps sqrt(W_ii W_jj)`."""
+    """True where a contact i is coupled to a `touched` one j:
+    `|W_ij| > eps sqrt(W_ii W_jj)`.
+    """
     m = touched.shape[0]
     w = jnp.abs(contacts.delassus[:m, :m])
     size = jnp.sqrt(jnp.diagonal(w))
@@ -451,17 +517,21 @@ def _undisturbed(
 ) -> Bool[Array, ""]:
     """True where no other contact closes within the time that an accumulation takes.
 
-    Gaps fall as parabolas `f + f' s + f'' s^2 / 2` with the forces of the resting contacts.
+    Gaps fall as parabolas `f + f' s + f'' s^2 / 2` with the forces of the resting
+    contacts.
     """
     m = result.at_rest.shape[0]
-    gap, normals = jnp.maximum(contacts.normal.value, 0.0), contacts.normal.gradient
+    gap = jnp.maximum(contacts.normal.value, 0.0)
+    normals = contacts.normal.gradient
     rate = normals.T @ (result.jump.v - carried_along(system, result.jump.v, t))
     fall = contacts.approach[:m] + contacts.delassus[:m, :m] @ result.force
     square = rate * rate - 2 * fall * gap
     root = jnp.sqrt(jnp.maximum(square, 0.0))
     # time of the zero: with f' < 0 in a form without cancellation
     later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
-    reached = jnp.where(rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later)
+    reached = jnp.where(
+        rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later
+    )
     never = (square < 0) | ((rate >= 0) & (fall >= 0))
     return jnp.all(result.at_rest | never | (reached > result.passed.time))
 
@@ -469,7 +539,8 @@ def _undisturbed(
 def _approach(
     choice: ModeChoice, slip: Float[Array, " m"], held: Bool[Array, " m"]
 ) -> Float[Array, ""]:
-    """Gap velocity [m/s] of an impact without collision: a share of the largest slip of `held`.
+    """Gap velocity [m/s] of an impact without collision: a share of the largest slip of
+    `held`.
 
     The share is the root of rounding, and MORE of what is left of the regularity.
     """
@@ -478,14 +549,20 @@ def _approach(
     return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
 
 
-def velocity_noise(settings: Settings, acceleration: Float[Array, ""]) -> Float[Array, ""]:
-    """Velocity [m/s] that this acceleration [m/s^2] gives within the rounding of time."""
+def velocity_noise(
+    settings: Settings, acceleration: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Velocity [m/s] that this acceleration [m/s^2] gives within the rounding of
+    time.
+    """
     duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
     return precision(duration.dtype).accumulated * duration * acceleration
 
 
 def _rest_speed(settings: Settings, scales: Scales) -> Float[Array, ""]:
-    """Gap velocity [m/s] below which it is 0: a share of `scales.speed`, and `velocity_noise`."""
+    """Gap velocity [m/s] below which it is 0: a share of `scales.speed`, and
+    `velocity_noise`.
+    """
     rounding = velocity_noise(settings, scales.acceleration)
     return not_rounding(REST_SPEED, rounding.dtype) * scales.speed + rounding
 
@@ -501,7 +578,10 @@ def _jump_if(
     scales: Scales,
 ) -> Jump:
     """`impact_jump` of the closed contacts if one `strikes`, else `no_jump`."""
-    lead = approach if settings.friction else None
+    if settings.friction:
+        lead = approach
+    else:
+        lead = None
     noise = _rest_speed(settings, scales)
     m = closed.shape[0]
     return jax.lax.cond(
@@ -538,18 +618,21 @@ def _with_friction(
 def _largest_scales(
     system: System, settings: Settings, scales: Scales, contacts: Contacts, state: State
 ) -> Scales:
-    """Largest values of the motion so far, those of this state included; without derivatives.
+    """Largest values of the motion so far, those of this state included; without
+    derivatives.
 
-    Equation: `max |f'|`; `speed_of` the kinetic energy, absolute and seen from the base, at least
-    `sqrt(a closed_below)`; a, the largest of |f''| without contact forces, the sum of the sizes of
-    its terms, and the speed over the duration.
+    Equation: `max |f'|`; `speed_of` the kinetic energy, absolute and seen from the
+    base, at least `sqrt(a closed_below)`; a, the largest of |f''| without contact
+    forces, the sum of the sizes of its terms, and the speed over the duration.
     """
     m = contacts.normal.rate.shape[0]
     relative = state.v - carried_along(system, state.v, state.t)
-    energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, relative))
+    energy = jnp.maximum(
+        kinetic(system, state.q, state.v), kinetic(system, state.q, relative)
+    )
     speed = speed_of(energy, jnp.diagonal(contacts.delassus))
-    # the terms of an acceleration may cancel: what bodies side by side leave of it is rounding, and
-    # so is what does not change the speed within the motion
+    # the terms of an acceleration may cancel: what bodies side by side leave of it is
+    # rounding, and so is what does not change the speed within the motion
     terms = jnp.abs(contacts.directions[:, :m]).T @ jnp.abs(contacts.free)
     acceleration = jnp.maximum(jnp.abs(contacts.approach[:m]), terms).max()
     acceleration = jnp.maximum(acceleration, speed / settings.duration)
@@ -579,24 +662,25 @@ def _brought_to_rest(
 ) -> _Stop:
     """Gap velocities of `held` contacts set to 0, and the slip of those that `stick`.
 
-    Equation: `W p = -rates` and `W force = -approach` in these rows, `v += M^-1 D p`; the contacts
-    give the energy `p rates / 2`, as their mean velocity is half of that before.
+    Equation: `W p = -rates` and `W force = -approach` in these rows, `v += M^-1 D p`;
+    the contacts give the energy `p rates / 2`, as their mean velocity is half of that
+    before.
     """
     m = held.shape[0]
-    modes, rates = (
-        no_modes(m, jump.v.dtype)._replace(active=held, stick=stick),
-        contacts.normal.rate,
-    )
+    modes = no_modes(m, jump.v.dtype)._replace(active=held, stick=stick)
+    rates = contacts.normal.rate
     if contacts.tangent is not None:
         rates = jnp.concatenate([rates, contacts.tangent.rate])
     size = rates.shape[0]
     columns = jnp.stack([rates, contacts.approach[:size]], axis=1)
     p, force = constraint_impulse(contacts, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
-    work, tangential = 0.5 * p * rates, jnp.zeros_like(jump.tangential)
+    work = 0.5 * p * rates
+    tangential = jnp.zeros_like(jump.tangential)
     energy = jnp.stack([work[:m], jnp.zeros_like(work[:m])])
     if contacts.tangent is not None:
-        energy, tangential = energy.at[1].set(by_contact(work[m:], m).sum(axis=1)), p[m:]
+        energy = energy.at[1].set(by_contact(work[m:], m).sum(axis=1))
+        tangential = p[m:]
     # the gaps, up to `closed_below`, are closed by the flight that follows
     fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * contacts.normal.value, 0.0)
     carried = carried_along(system, jump.v, t)
@@ -611,18 +695,24 @@ def _brought_to_rest(
 
 
 def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Passed:
-    """Time and gap of the hops that a stop leaves out, from its energy and what the impact `lost`.
+    """Time and gap of the hops that a stop leaves out, from its energy and what the
+    impact `lost`.
 
-    Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E lifts it by
-    E / F at most. If each impact keeps r^2 of the energy, and k contacts strike in turn, hops
-    take `2 k p / F (1 + r + ..)` together: exact for a single contact. r^2 is the energy [J] that
-    the stop takes, over itself and `lost`, that of the last impact; `ends`: the k contacts.
+    Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E
+    lifts it by E / F at most. If each impact keeps r^2 of the energy, and k contacts
+    strike in turn, hops take `2 k p / F (1 + r + ..)` together: exact for a single
+    contact. r^2 is the energy [J] that the stop takes, over itself and `lost`, that of
+    the last impact; `ends`: the k contacts.
     """
-    p, energy = stop.impulse[: len(ends)], stop.energy
+    p = stop.impulse[: len(ends)]
+    energy = stop.energy
     pressed = ends & (stop.force > 0)
-    force, some = jnp.where(pressed, stop.force, 1.0), jnp.any(pressed) & (energy > 0)
-    before = jnp.where(some, energy + jnp.maximum(lost, 0), 1.0)  # energy before the last impact
-    r = jnp.sqrt(jnp.where(some, energy, 0.25) / before)  # 1/2 where nothing is passed: not used
+    force = jnp.where(pressed, stop.force, 1.0)
+    some = jnp.any(pressed) & (energy > 0)
+    # energy before the last impact
+    before = jnp.where(some, energy + jnp.maximum(lost, 0), 1.0)
+    # 1/2 where nothing is passed: not used
+    r = jnp.sqrt(jnp.where(some, energy, 0.25) / before)
     hop = jnp.max(jnp.where(pressed, 2 * jnp.abs(p) / force, 0.0))
     lift = jnp.max(jnp.where(pressed, energy / force, 0.0))
     return Passed(jnp.sum(ends.astype(p.dtype)) * hop / (1 - r), lift)
@@ -637,8 +727,9 @@ def _kind(
 ) -> Int[Array, ""]:
     """Kind of the event; the later of these that holds.
 
-    none (at the start), contact, friction: a margin has `fired`; detachment: a contact `parts`;
-    impact where one `strikes`: accumulation if it `ends` one, paroxysm if it `jams`.
+    none (at the start), contact, friction: a margin has `fired`; detachment: a contact
+    `parts`; impact where one `strikes`: accumulation if it `ends` one, paroxysm if it
+    `jams`.
     """
     m = len(parts)
     kind = jnp.where(jnp.any(fired[:m]), KIND_CODE["contact"], KIND_CODE["none"])

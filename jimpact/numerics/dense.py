@@ -1,8 +1,9 @@
-"""Small dense systems: elimination, singular matrices, and how redundant contacts share forces.
+"""Small dense systems: elimination, singular matrices, and how redundant contacts share
+forces.
 
-LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, B). The functions
-`solve_definite`, `solve_mass_matrix`, `solve_by_pivots`, `singular_values`, `eigenvectors`,
-`null_projector`, `solve_symmetric` and `determinants` have no batch.
+LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, B). The
+functions `solve_definite`, `solve_mass_matrix`, `solve_by_pivots`, `singular_values`,
+`eigenvectors`, `null_projector`, `solve_symmetric` and `determinants` have no batch.
 
 WHICH ONE
 
@@ -15,22 +16,29 @@ WHICH ONE
     pseudoinverse           the same, with the least forces
     singular_values,        one matrix whose rank is asked for
     eigenvectors
-    elsewhere               `sparse.conjugate_gradients` for packings, `tridiagonal.py` for chains
+    elsewhere               `sparse.conjugate_gradients` for packings, `tridiagonal.py`
+    for chains
 
-LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in batches,
-loops of our own do, up to `_BY_LOOP` rows.
+LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in
+batches, loops of our own do, up to `_BY_LOOP` rows.
 
-COMPILING   Elimination of more than two rows is a loop over the pivots, and products of more than
-`COLUMNS_WRITTEN_OUT` columns are reductions: programs do not grow with the number of contacts.
+COMPILING   Elimination of more than two rows is a loop over the pivots, and products of
+more than `COLUMNS_WRITTEN_OUT` columns are reductions: programs do not grow with the
+number of contacts.
 
-SINGULAR MATRICES   Where contacts are redundant, many forces give the same motion. Velocities never
-depend on the choice; it decides which contact reaches its friction cone first:
+SINGULAR MATRICES   Where contacts are redundant, many forces give the same motion.
+Velocities never depend on the choice; it decides which contact reaches its friction
+cone first:
 
-    sticking contacts, in the plane   in proportion to mu F: `load_shares` weight a `regularized`
+    sticking contacts, in the plane   in proportion to mu F: `load_shares` weight a
+    `regularized`
                                       system. They break loose together.
-    sticking contacts, in space       least sum of squares: `pseudoinverse`, taken once a step,
-                                      when the normal forces of its stages are not known yet
-    normal forces and impulses        least sum of squares, in the scaling with unit diagonal
+    sticking contacts, in space       least sum of squares: `pseudoinverse`, taken once
+    a step,
+                                      when the normal forces of its stages are not known
+                                      yet
+    normal forces and impulses        least sum of squares, in the scaling with unit
+    diagonal
 """
 
 import functools
@@ -47,22 +55,24 @@ from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import cond, fori_loop, while_loop
 from jimpact.tools.precision import precision
 
-# Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is three to six
-# times as fast for 4 rows. With ten times more the cubic cost of many contacts would not be
-# blocked.
+# Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is
+# three to six times as fast for 4 rows. With ten times more the cubic cost of many
+# contacts would not be blocked.
 _BY_LOOP = 16
-# Rows up to which a loop of our own eliminates block by block: as many again take eight times as
-# long, which LAPACK does in half of that.
+# Rows up to which a loop of our own eliminates block by block: as many again take eight
+# times as long, which LAPACK does in half of that.
 _BLOCKS = 64
-# Columns up to which products are written out: a reduction does not fuse with what follows it, and
-# is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
-# times more would make large programs of long chains.
+# Columns up to which products are written out: a reduction does not fuse with what
+# follows it, and is no vector operation: four times as long for the 12 of four contacts
+# with friction in space. Ten times more would make large programs of long chains.
 COLUMNS_WRITTEN_OUT = 12
-# Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in its
-# pseudoinverse. Ten times more would drop small, regular parts.
+# Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in
+# its pseudoinverse. Ten times more would drop small, regular parts.
 _NEGLIGIBLE_PART = 4.0
-_JACOBI_SWEEPS = 12  # over all pairs of up to 16 columns; 10 are enough, more only cost time
-_NEWTON_SCHULZ = 3  # iterations, each of which squares the error; ten times more only cost time
+# over all pairs of up to 16 columns; 10 are enough, more only cost time
+_JACOBI_SWEEPS = 12
+# iterations, each of which squares the error; ten times more only cost time
+_NEWTON_SCHULZ = 3
 
 
 # ---- products
@@ -75,8 +85,12 @@ def unit(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n ..."]:
     )
 
 
-def times(matrix: Float[Array, "a b *#B"], vector: Float[Array, "b *#B"]) -> Float[Array, "a *#B"]:
-    """Products `A x = sum_j A_j x_j` of columns A_j; one matrix without batch serves all x."""
+def times(
+    matrix: Float[Array, "a b *#B"], vector: Float[Array, "b *#B"]
+) -> Float[Array, "a *#B"]:
+    """Products `A x = sum_j A_j x_j` of columns A_j; one matrix without batch serves
+    all x.
+    """
     if matrix.ndim == 2:
         return matrix @ vector
     if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
@@ -85,11 +99,17 @@ def times(matrix: Float[Array, "a b *#B"], vector: Float[Array, "b *#B"]) -> Flo
     return functools.reduce(jnp.add, columns)
 
 
-def product(a: Float[Array, "n k *#B"], b: Float[Array, "k l *#B"]) -> Float[Array, "n l *#B"]:
-    """Products of matrices, `A B = sum_j A_j b_j`, of columns A_j of A and rows b_j of B."""
+def product(
+    a: Float[Array, "n k *#B"], b: Float[Array, "k l *#B"]
+) -> Float[Array, "n l *#B"]:
+    """Products of matrices, `A B = sum_j A_j b_j`, of columns A_j of A and rows b_j of
+    B.
+    """
     if a.shape[1] > COLUMNS_WRITTEN_OUT:
         return jnp.sum(a[:, :, None] * b[None], axis=1)
-    return functools.reduce(jnp.add, [a[:, j, None] * b[j][None] for j in range(a.shape[1])])
+    return functools.reduce(
+        jnp.add, [a[:, j, None] * b[j][None] for j in range(a.shape[1])]
+    )
 
 
 # ---- elimination
@@ -100,13 +120,14 @@ def solve(
 ) -> Float[Array, "n c *#B"]:
     """`A^-1 right` for c right sides of each matrix A.
 
-    Gauss-Jordan in a loop over the pivots, which are not chosen: matrices that are similar to a
-    positive definite one do not need that.
+    Gauss-Jordan in a loop over the pivots, which are not chosen: matrices that are
+    similar to a positive definite one do not need that.
     """
     n = len(matrix)
     if n == 1:
         return right / matrix
-    if n == 2:  # written out: the loop takes 8 % of a batch of impacts with planar friction
+    # written out: the loop takes 8 % of a batch of impacts with planar friction
+    if n == 2:
         return _solve_two(matrix, right)
     return _eliminated(matrix, right, lambda pivot: 1 / pivot)
 
@@ -116,12 +137,18 @@ def _eliminated(
     right: Float[Array, "n c *#B"],
     inverted: Callable[[jax.Array], jax.Array],
 ) -> Float[Array, "n c *#B"]:
-    """`A^-1 right` by Gauss-Jordan in a loop over the pivots; `inverted` gives 1 / pivot."""
+    """`A^-1 right` by Gauss-Jordan in a loop over the pivots; `inverted` gives 1 /
+    pivot.
+    """
     n = len(matrix)
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
 
-    def eliminate(k: Int[Array, ""] | int, rows: Float[Array, "n w *B"]) -> Float[Array, "n w *B"]:
-        """Rows of [A, right] after pivot k: row k is divided by it, other a_jk are 0."""
+    def eliminate(
+        k: Int[Array, ""] | int, rows: Float[Array, "n w *B"]
+    ) -> Float[Array, "n w *B"]:
+        """Rows of [A, right] after pivot k: row k is divided by it, other a_jk are
+        0.
+        """
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         row = row * inverted(jax.lax.dynamic_index_in_dim(row, k, 1))
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
@@ -134,8 +161,11 @@ def _solve_two(
     matrix: Float[Array, "2 2 *#B"], right: Float[Array, "2 c *#B"]
 ) -> Float[Array, "2 c *#B"]:
     """`A^-1 right` for two rows, by the operations of `_eliminated`, written out."""
-    scale, factor = 1 / matrix[0, :1], matrix[1, :1]  # of row 0, 1 / a_00 and a_10
-    above, x = matrix[0, 1:] * scale, right[0] * scale
+    # of row 0, 1 / a_00 and a_10
+    scale = 1 / matrix[0, :1]
+    factor = matrix[1, :1]
+    above = matrix[0, 1:] * scale
+    x = right[0] * scale
     last = (right[1] - factor * x) * (1 / (matrix[1, 1:] - factor * above))
     return jnp.stack([x - above * last, last])
 
@@ -147,9 +177,15 @@ def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
         return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
 
-    def eliminate(k: Int[Array, ""] | int, rows: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
-        """The matrix after pivot k; column k is then that of the eliminations so far."""
-        in_row, in_column = number == k, number[:, 0][None] == k  # masks of row and column k
+    def eliminate(
+        k: Int[Array, ""] | int, rows: Float[Array, "n n *B"]
+    ) -> Float[Array, "n n *B"]:
+        """The matrix after pivot k; column k is then that of the eliminations so
+        far.
+        """
+        # masks of row and column k
+        in_row = number == k
+        in_column = number[:, 0][None] == k
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
@@ -160,8 +196,12 @@ def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
 
 
 @jax.jit
-def solve_definite(g: Float[Array, "m m"], right: Float[Array, "m *c"]) -> Float[Array, "m *c"]:
-    """`G^-1 right` for a symmetric positive definite G and one or several right sides."""
+def solve_definite(
+    g: Float[Array, "m m"], right: Float[Array, "m *c"]
+) -> Float[Array, "m *c"]:
+    """`G^-1 right` for a symmetric positive definite G and one or several right
+    sides.
+    """
     if len(g) > _BY_LOOP:
         return jnp.linalg.solve(g, right)
     return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
@@ -171,7 +211,8 @@ def solve_definite(g: Float[Array, "m m"], right: Float[Array, "m *c"]) -> Float
 def solve_mass_matrix(
     mass: Float[Array, " n"] | Float[Array, "n n"], right: Float[Array, "n *c"]
 ) -> Float[Array, "n *c"]:
-    """`M^-1 right` of a mass matrix M, or of its diagonal, for one or several right sides.
+    """`M^-1 right` of a mass matrix M, or of its diagonal, for one or several right
+    sides.
 
     NaN where M is a matrix that is not positive definite.
     """
@@ -180,31 +221,41 @@ def solve_mass_matrix(
     if len(mass) > _BY_LOOP:
         return jax.scipy.linalg.solve(mass, right, assume_a="pos")
     columns = right.reshape(len(mass), -1, 1)
-    solved = _eliminated(mass[..., None], columns, lambda p: 1 / jnp.where(p > 0, p, jnp.nan))
+    solved = _eliminated(
+        mass[..., None], columns, lambda p: 1 / jnp.where(p > 0, p, jnp.nan)
+    )
     return solved.reshape(right.shape)
 
 
 def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"]:
-    """Inverses of N matrices of m by m blocks, block by block, b = 2 or 3, without pivots.
+    """Inverses of N matrices of m by m blocks, block by block, b = 2 or 3, without
+    pivots.
 
-    A singular block is perturbed by eps^(2/3), which refinements by the caller undo. More would
-    perturb regular blocks, too, in single precision.
+    A singular block is perturbed by eps^(2/3), which refinements by the caller undo.
+    More would perturb regular blocks, too, in single precision.
     """
     perturbation = precision(matrix.dtype).eps ** (2 / 3)
-    m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
+    m = len(matrix)
+    eye = jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
 
     def eliminate(
         i: Int[Array, ""] | int, inverse: Float[Array, "m b m b N"]
     ) -> Float[Array, "m b m b N"]:
-        """Matrices after Gauss-Jordan elimination in place, with diagonal block i as pivot."""
+        """Matrices after Gauss-Jordan elimination in place, with diagonal block i as
+        pivot.
+        """
         pivot = (jnp.arange(m) == i)[:, None, None, None]
-        column, row = inverse[:, :, i], inverse[i]  # (m, b, b, N) and (b, m, b, N) of blocks
+        # (m, b, b, N) and (b, m, b, N) of blocks
+        column = inverse[:, :, i]
+        row = inverse[i]
         block = _small_inverse(column[i], perturbation)
         column = jnp.where(pivot, -eye[None], column)
         row = jnp.where(pivot[:, 0][None], eye[:, None], row)
         row = jnp.sum(block[:, :, None, None] * row[None], axis=1)  # block times row
-        replaced = pivot[..., None] | pivot[None, None, :, 0]  # row i and column i of blocks
-        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)  # column times row
+        # row i and column i of blocks
+        replaced = pivot[..., None] | pivot[None, None, :, 0]
+        # column times row
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
         return jnp.where(replaced, 0.0, inverse) - spread
 
     return fori_loop(0, m, eliminate, matrix)
@@ -224,7 +275,9 @@ def block_solve(
     perturbation = precision(matrix.dtype).eps ** 2  # of a block that is singular
     rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
 
-    def eliminate(i: Int[Array, ""] | int, rows: Float[Array, "m b w"]) -> Float[Array, "m b w"]:
+    def eliminate(
+        i: Int[Array, ""] | int, rows: Float[Array, "m b w"]
+    ) -> Float[Array, "m b w"]:
         """Rows of [A, right] after elimination with the diagonal block i as pivot."""
         row = jax.lax.dynamic_index_in_dim(rows, i, 0, keepdims=False)
         block = jax.lax.dynamic_slice_in_dim(row, i * b, b, axis=1)
@@ -236,8 +289,12 @@ def block_solve(
     return fori_loop(0, m, eliminate, rows)[..., m * b :]
 
 
-def _small_inverse(block: Float[Array, "b b N"], perturbation: float) -> Float[Array, "b b N"]:
-    """Inverses `adj(A) / det(A)` of blocks, b = 2 or 3, perturbed where they are singular."""
+def _small_inverse(
+    block: Float[Array, "b b N"], perturbation: float
+) -> Float[Array, "b b N"]:
+    """Inverses `adj(A) / det(A)` of blocks, b = 2 or 3, perturbed where they are
+    singular.
+    """
     singular = jnp.abs(_small_determinant(block)) < perturbation
     eye = jnp.eye(len(block), dtype=block.dtype)[..., None]
     block = block + jnp.where(singular, perturbation, 0.0)[None, None] * eye
@@ -251,9 +308,13 @@ def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, " N"]:
 
 
 def _cofactors(a: Float[Array, "b b N"]) -> Float[Array, "b b N"]:
-    """Adjugates `adj(A) = det(A) A^-1` of blocks, b = 2 or 3; their columns are cross products."""
+    """Adjugates `adj(A) = det(A) A^-1` of blocks, b = 2 or 3; their columns are cross
+    products.
+    """
     if len(a) == 2:
-        return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+        return jnp.stack(
+            [jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])]
+        )
     sides = [jnp.cross(a[i], a[j], axis=0) for i, j in ((1, 2), (2, 0), (0, 1))]
     return jnp.stack(sides, axis=1)
 
@@ -264,8 +325,8 @@ def solve_by_pivots(
 ) -> tuple[Float[Array, "n c"], Float[Array, ""]]:
     """`A^-1 right` of any matrix A, and its determinant.
 
-    Gauss-Jordan with partial pivoting, in a loop over the pivots. Where the matrix is singular the
-    determinant is 0 and the solution not finite.
+    Gauss-Jordan with partial pivoting, in a loop over the pivots. Where the matrix is
+    singular the determinant is 0 and the solution not finite.
     """
     n = len(matrix)
     number = jnp.arange(n)[:, None]
@@ -273,7 +334,9 @@ def solve_by_pivots(
     def eliminate(
         k: Int[Array, ""] | int, state: tuple[Float[Array, "n w"], Float[Array, ""]]
     ) -> tuple[Float[Array, "n w"], Float[Array, ""]]:
-        """Rows of [A, right] after the largest pivot in column k; the product of all pivots."""
+        """Rows of [A, right] after the largest pivot in column k; the product of all
+        pivots.
+        """
         rows, determinant = state
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         largest = jnp.argmax(jnp.where(number >= k, jnp.abs(column), -1.0), axis=0)[0]
@@ -284,7 +347,8 @@ def solve_by_pivots(
         row = chosen / pivot
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
         signed = jnp.where(largest == k, pivot, -pivot)[0, 0]
-        determinant = jnp.where(determinant == 0, 0.0, determinant * signed)  # NaN after 0
+        # NaN after 0
+        determinant = jnp.where(determinant == 0, 0.0, determinant * signed)
         return jnp.where(number == k, row, rows - factor * row), determinant
 
     one = jnp.ones((), matrix.dtype)
@@ -296,14 +360,18 @@ def solve_by_pivots(
 def determinants(k: Float[Array, "N n n"]) -> Float[Array, " N"]:
     """Determinants of N matrices.
 
-    Those of four rows are sums of products of minors of two rows (Laplace), quicker to compile.
+    Those of four rows are sums of products of minors of two rows (Laplace), quicker to
+    compile.
     """
     if k.shape[-1] != 4:
         none = jnp.zeros((k.shape[-1], 0), k.dtype)
         return jax.vmap(lambda matrix: solve_by_pivots(matrix, none)[1])(k)
     left, right = np.triu_indices(4, 1)
-    a, b = k[..., left], k[..., right]  # entries of each row in both columns of a minor
-    minors = a[:, ::2] * b[:, 1::2] - b[:, ::2] * a[:, 1::2]  # of rows 1 and 2, of 3 and 4
+    # entries of each row in both columns of a minor
+    a = k[..., left]
+    b = k[..., right]
+    # of rows 1 and 2, of 3 and 4
+    minors = a[:, ::2] * b[:, 1::2] - b[:, ::2] * a[:, 1::2]
     signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
     return jnp.sum(minors[:, 0] * minors[:, 1, ::-1] * signs[None], axis=-1)
 
@@ -311,14 +379,19 @@ def determinants(k: Float[Array, "N n n"]) -> Float[Array, " N"]:
 # ---- singular matrices: redundant contacts
 
 
-def load_shares(limit: Float[Array, "m *B"], least: float = 0.0) -> Float[Array, "m *B"]:
-    """Weights `limit_j / max_k limit_k` of the contacts in the sharing of redundant forces.
+def load_shares(
+    limit: Float[Array, "m *B"], least: float = 0.0
+) -> Float[Array, "m *B"]:
+    """Weights `limit_j / max_k limit_k` of the contacts in the sharing of redundant
+    forces.
 
     None is below `least`, which keeps the weights of contacts without load regular.
     """
     largest = jax.lax.stop_gradient(jnp.max(limit, axis=0, keepdims=True))
     share = limit / jnp.where(largest > 0, largest, 1.0)
-    return jnp.maximum(share, least) if least > 0 else share
+    if least > 0:
+        return jnp.maximum(share, least)
+    return share
 
 
 def regularized(
@@ -328,25 +401,33 @@ def regularized(
     refinements: int,
     without_null: bool = False,
 ) -> Float[Array, "n *#B"]:
-    """z with `A z = right` where A may be singular: `(A + diag(ridge))^-1` and refinements.
+    """z with `A z = right` where A may be singular: `(A + diag(ridge))^-1` and
+    refinements.
 
     One matrix without batch serves all right sides, with a ridge of one column.
-    Each refinement `z <- z + (A + ridge)^-1 (right - A z)` removes what the ridge changes where A
-    is regular, and makes the derivatives right in one order more: the inverse has none. In the
-    null space of A the inverse is large, and so is its rounding: `without_null` subtracts that
-    part.
+    Each refinement `z <- z + (A + ridge)^-1 (right - A z)` removes what the ridge
+    changes where A is regular, and makes the derivatives right in one order more: the
+    inverse has none. In the null space of A the inverse is large, and so is its
+    rounding: `without_null` subtracts that part.
 
     The barriers keep XLA from computing what is multiplied once more for each column.
     """
     kept = jax.lax.optimization_barrier  # computed once, see above
-    matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
-    on_diagonal = ridge if matrix.ndim == 2 else ridge[:, None]
+    # apart: only the right side is linear in tangents
+    matrix = kept(matrix)
+    right = kept(right)
+    if matrix.ndim == 2:
+        on_diagonal = ridge
+    else:
+        on_diagonal = ridge[:, None]
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * on_diagonal))
 
     def solved(right: Float[Array, "n *#B"]) -> Float[Array, "n *#B"]:
         """`z = (A + ridge)^-1 right`, `without_null` less `(A + ridge)^-1 ridge z`."""
         z = times(inverted, right)
-        return z - times(inverted, ridge * z) if without_null else z
+        if without_null:
+            return z - times(inverted, ridge * z)
+        return z
 
     z = solved(right)
     for _ in range(refinements):
@@ -357,7 +438,9 @@ def regularized(
 
 @jax.custom_jvp
 def regularized_once(
-    matrix: Float[Array, "n n *#B"], ridge: Float[Array, "n *#B"], right: Float[Array, "n *#B"]
+    matrix: Float[Array, "n n *#B"],
+    ridge: Float[Array, "n *#B"],
+    right: Float[Array, "n *#B"],
 ) -> Float[Array, "n *#B"]:
     """`regularized` with one refinement; tangents solve the same equations."""
     return regularized(matrix, right, ridge, 1)
@@ -368,8 +451,11 @@ def regularized_once(
 def _regularized_tangent(
     primals: Any, tangents: Any
 ) -> tuple[Float[Array, "n *#B"], Float[Array, "n *#B"]]:
-    """z with `A z = right`, and its tangent dz, which solves `A dz = d right - dA z`."""
-    (matrix, ridge, right), (dmatrix, _, dright) = primals, tangents
+    """z with `A z = right`, and its tangent dz, which solves
+    `A dz = d right - dA z`.
+    """
+    matrix, ridge, right = primals
+    dmatrix, _, dright = tangents
     z = regularized_once(matrix, ridge, right)
     return z, regularized_once(matrix, ridge, dright - times(dmatrix, z))
 
@@ -377,10 +463,12 @@ def _regularized_tangent(
 def pseudoinverse(
     matrix: Float[Array, "n n *B"], held: Bool[Array, "n *B"]
 ) -> Float[Array, "n n *B"]:
-    """Pseudoinverses of positive semidefinite K in the rows and columns `held`; 0 elsewhere.
+    """Pseudoinverses of positive semidefinite K in the rows and columns `held`; 0
+    elsewhere.
 
-    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes from what
-    K transmits, to rounding; in the null space of K, forces are the least ones to some percent.
+    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z`
+    removes from what K transmits, to rounding; in the null space of K, forces are the
+    least ones to some percent.
     """
     both = held[:, None] & held[None]
     k = jnp.where(both, matrix, 0.0)
@@ -395,9 +483,11 @@ def pseudoinverse(
 
 
 class SingularValues(NamedTuple):
-    """Singular value decomposition `A = left diag(values) right`, values falling, of N matrices.
+    """Singular value decomposition `A = left diag(values) right`, values falling, of N
+    matrices.
 
-    `null` marks the values that are 0; their vectors are an orthonormal basis of the null space.
+    `null` marks the values that are 0; their vectors are an orthonormal basis of the
+    null space.
     """
 
     left: Float[Array, "*N n n"]
@@ -407,7 +497,9 @@ class SingularValues(NamedTuple):
 
 
 def _are_null(values: Float[Array, "n *N"]) -> Bool[Array, "n *N"]:
-    """Mask of singular values that are rounding: `<= precision.singular n` times the largest."""
+    """Mask of singular values that are rounding: `<= precision.singular n` times the
+    largest.
+    """
     return values <= precision(values.dtype).singular * len(values) * values[:1]
 
 
@@ -444,9 +536,12 @@ def _batch_of_singular_values(
 
 
 @jax.custom_batching.custom_vmap
-def eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues and, in columns, eigenvectors of one positive semidefinite matrix, without
-    derivatives."""
+def eigenvectors(
+    matrix: Float[Array, "n n"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues and, in columns, eigenvectors of one positive semidefinite matrix,
+    without derivatives.
+    """
     values, vectors = jnp.linalg.eigh(matrix)
     return values, vectors
 
@@ -455,7 +550,9 @@ def eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float
 def _batch_of_eigenvectors(
     size: int, batched: Any, matrices: Float[Array, "N n n"]
 ) -> tuple[tuple[Float[Array, "N n"], Float[Array, "N n n"]], tuple[bool, bool]]:
-    """Rule of `vmap`: V by Jacobi's rotations, eigenvalues as the lengths of columns of A V."""
+    """Rule of `vmap`: V by Jacobi's rotations, eigenvalues as the lengths of columns of
+    A V.
+    """
     if matrices.shape[-1] > _BY_LOOP:
         values, vectors = jnp.linalg.eigh(matrices)
         return (values, vectors), (True, True)
@@ -466,20 +563,25 @@ def _batch_of_eigenvectors(
 def _orthogonal(
     matrix: Float[Array, "n n B"],
 ) -> tuple[Float[Array, "n n B"], Float[Array, "n n B"], Float[Array, "n B"]]:
-    """`A V` with orthogonal columns, the orthogonal V, and the falling lengths of columns of A V.
+    """`A V` with orthogonal columns, the orthogonal V, and the falling lengths of
+    columns of A V.
 
-    In each round, columns at the same place of two rows are rotated. Then all but the first move
-    on by one place, so that after a sweep each has met each.
+    In each round, columns at the same place of two rows are rotated. Then all but the
+    first move on by one place, so that after a sweep each has met each.
 
-    Source: Hestenes, J. SIAM 6 (1958); Brent and Luk, SIAM J. Sci. Stat. Comput. 6 (1985).
+    Source: Hestenes, J. SIAM 6 (1958); Brent and Luk, SIAM J. Sci. Stat. Comput. 6
+    (1985).
     """
     n = len(matrix)
-    places = n + n % 2  # an odd number of columns: one of zeros, which no rotation changes
+    # an odd number of columns: one of zeros, which no rotation changes
+    places = n + n % 2
     both = jnp.concatenate([matrix, jnp.broadcast_to(unit(matrix), matrix.shape)])
     both = jnp.pad(both, ((0, 0), (0, places - n), (0, 0)))
 
     class Sweep(NamedTuple):
-        """Columns of [A V; V] in two rows, the largest cos^2 between two of A V, sweeps done."""
+        """Columns of [A V; V] in two rows, the largest cos^2 between two of A V, sweeps
+        done.
+        """
 
         first: Float[Array, "entries pairs B"]
         second: Float[Array, "entries pairs B"]
@@ -487,16 +589,22 @@ def _orthogonal(
         done: Int[Array, ""]
 
     def rotate(_: Any, at: Sweep) -> Sweep:
-        """State after one round: columns x, y of a pair are turned until x . y = 0, and move on.
+        """State after one round: columns x, y of a pair are turned until x . y = 0, and
+        move on.
 
-        The slope t of the angle is the small root of `t^2 + (|y|^2 - |x|^2) / (x . y) t = 1`.
+        The slope t of the angle is the small root of
+        `t^2 + (|y|^2 - |x|^2) / (x . y) t = 1`.
         """
         x, y, largest, done = at
         product = jnp.sum(x[:n] * y[:n], axis=0, keepdims=True)
-        squares = [jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)]
+        squares = [
+            jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)
+        ]
         half = (squares[1] - squares[0]) / 2
         real = jnp.minimum(*squares) > (rounding**2) * whole  # other columns are 0
-        angle = jnp.where(real, product**2 / jnp.where(real, squares[0] * squares[1], 1.0), 0.0)
+        angle = jnp.where(
+            real, product**2 / jnp.where(real, squares[0] * squares[1], 1.0), 0.0
+        )
         root = jnp.sqrt(half**2 + product**2)
         longer = jnp.where(half >= 0, half + root, half - root)
         slope = product / jnp.where(longer != 0, longer, 1.0)
@@ -507,10 +615,14 @@ def _orthogonal(
         if places == 2:
             return Sweep(x, y, largest, done)
         first = jnp.concatenate([x[:, :1], y[:, :1], x[:, 1:-1]], axis=1)
-        return Sweep(first, jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1), largest, done)
+        return Sweep(
+            first, jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1), largest, done
+        )
 
     def sweep(at: Sweep) -> Sweep:
-        """State after a sweep: as many rounds as make each column meet each other one."""
+        """State after a sweep: as many rounds as make each column meet each other
+        one.
+        """
         start = at._replace(cosine=jnp.zeros_like(at.cosine))
         end = fori_loop(0, places - 1, rotate, start)
         return end._replace(done=at.done + 1)
@@ -529,8 +641,11 @@ def _orthogonal(
     return both[:n], both[n:], jnp.take_along_axis(length, order, axis=0)
 
 
-def null_projector(g: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
-    """Orthogonal projector on the null space of G (unit diagonal), and whether it is not 0.
+def null_projector(
+    g: Float[Array, "m m"],
+) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
+    """Orthogonal projector on the null space of G (unit diagonal), and whether it is
+    not 0.
 
     Held constant in derivatives: a perturbation is taken to keep the rank.
     """
@@ -543,10 +658,11 @@ def null_projector(g: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Bool[Ar
 def solve_symmetric(
     g: Float[Array, "m m"], right: Float[Array, " m"], *, regular: bool = False
 ) -> tuple[Float[Array, " m"], Bool[Array, ""], Bool[Array, ""]]:
-    """x of least norm with `G x = right`, whether G is singular, and whether no x solves it.
+    """x of least norm with `G x = right`, whether G is singular, and whether no x
+    solves it.
 
-    G is symmetric positive semidefinite with a diagonal of order 1; `regular` if that is known
-    beforehand. With P the projector on its null space, `(G + P) x = right`.
+    G is symmetric positive semidefinite with a diagonal of order 1; `regular` if that
+    is known beforehand. With P the projector on its null space, `(G + P) x = right`.
     """
     if regular:
         no = jnp.asarray(False)

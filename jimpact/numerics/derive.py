@@ -1,16 +1,17 @@
 """Lanes and derivatives of programs with loops.
 
-LANES   A function of arrays (.., B) has its batch in the last axis: entries of one impact would
-otherwise be neighbours in memory, and loops over two or three of them do not fill a vector unit.
-`vmap` only makes B longer. One impact is a batch of one: there is no second code path. The function
-is an operation of JAX: levels of `vmap` (impacts, shots, starts) see its shapes only, and its loop
-is traced once, at the batch that is compiled. Its results are as the function states them.
+LANES   A function of arrays (.., B) has its batch in the last axis: entries of one
+impact would otherwise be neighbours in memory, and loops over two or three of them do
+not fill a vector unit. `vmap` only makes B longer. One impact is a batch of one: there
+is no second code path. The function is an operation of JAX: levels of `vmap` (impacts,
+shots, starts) see its shapes only, and its loop is traced once, at the batch that is
+compiled. Its results are as the function states them.
 
-DERIVATIVES   A loop of unknown length has no reverse mode. So a derivative is the contraction of
-the Jacobian with tangents, which JAX transposes, and the Jacobian is a function of the same form:
-both modes, every order, under jit and vmap in any nesting. A rule cannot tell which mode asks, so
-that the Jacobian in all numbers of an impact is computed for a single direction, too. Who needs one
-mode only says so: `ADJOINTS`.
+DERIVATIVES   A loop of unknown length has no reverse mode. So a derivative is the
+contraction of the Jacobian with tangents, which JAX transposes, and the Jacobian is a
+function of the same form: both modes, every order, under jit and vmap in any nesting. A
+rule cannot tell which mode asks, so that the Jacobian in all numbers of an impact is
+computed for a single direction, too. Who needs one mode only says so: `ADJOINTS`.
 """
 
 import dataclasses
@@ -28,27 +29,38 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float, Shaped
 
-from jimpact.numerics.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, is_smooth, value_of
+from jimpact.numerics.tangents import (
+    TANGENT_AXIS,
+    Dual,
+    dual_like,
+    is_dual,
+    is_smooth,
+    value_of,
+)
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import varying_like
 
-# Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
-# stay in a core's cache: 64 are no faster, 1024 take half as long again.
+# Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its
+# stages should stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
-# The same where impacts that are over make room for others: slots idle only at the end of a chunk.
-# Ten times more: ten times the memory for what enters and leaves.
+# The same where impacts that are over make room for others: slots idle only at the end
+# of a chunk. Ten times more: ten times the memory for what enters and leaves.
 QUEUE = 4096
 # Both of impacts with tangents, which take more room in the cache and in memory.
-CHUNK_WITH_TANGENTS, QUEUE_WITH_TANGENTS = 128, 512
-# Rows of a Jacobian that one run computes; further ones run it again. Ten times more: chains of
-# fifty balls take ten times the memory, and no less time.
+CHUNK_WITH_TANGENTS = 128
+QUEUE_WITH_TANGENTS = 512
+# Rows of a Jacobian that one run computes; further ones run it again. Ten times more:
+# chains of fifty balls take ten times the memory, and no less time.
 DIRECTIONS = 64
-# 'jacobian': both modes; 'forward': forward mode only, along the directions that are asked for;
-# 'checkpoints': reverse mode only, by running steps again from states that were kept.
+# 'jacobian': both modes; 'forward': forward mode only, along the directions that are
+# asked for; 'checkpoints': reverse mode only, by running steps again from states that
+# were kept.
 ADJOINTS = ("jacobian", "forward", "checkpoints")
 REVERSE_ONLY = (
-    "Argument `adjoint` must be 'jacobian' or 'forward' for derivatives in forward mode (jvp, "
-    "jacfwd, hessian), but has value 'checkpoints', which has the reverse mode only (grad, vjp)."
+    "Argument `adjoint` must be 'jacobian' or 'forward' for derivatives in forward "
+    "mode (jvp, "
+    "jacfwd, hessian), but has value 'checkpoints', which has the reverse mode only "
+    "(grad, vjp)."
 )
 
 
@@ -71,13 +83,15 @@ Function = Callable[..., Arrays]
 def in_lanes(
     function: Function, fine: Function, *arrays: jax.Array, adjoint: str = "jacobian"
 ) -> Arrays:
-    """`function(*arrays)`, where all arrays in and out have the batch in their last axis.
+    """`function(*arrays)`, where all arrays in and out have the batch in their last
+    axis.
 
-    Results that are whole numbers have no derivatives; the others have those of `fine`, which is
-    the same at a finer tolerance, with loops of `until_over` by `checkpoints` if these are the
-    `adjoint`. Functions are hashable and equal where they do the same: each is compiled once. One
-    that `takes_duals` gets `Dual` arguments where it is differentiated. One that `queues` gets
-    larger chunks of the batch: there impacts that are over make room for others.
+    Results that are whole numbers have no derivatives; the others have those of `fine`,
+    which is the same at a finer tolerance, with loops of `until_over` by `checkpoints`
+    if these are the `adjoint`. Functions are hashable and equal where they do the same:
+    each is compiled once. One that `takes_duals` gets `Dual` arguments where it is
+    differentiated. One that `queues` gets larger chunks of the batch: there impacts
+    that are over make room for others.
     """
     arrays = tuple(varying_like([jnp.asarray(x) for x in arrays], arrays))
     if adjoint == "checkpoints":
@@ -87,7 +101,9 @@ def in_lanes(
 
 @contextmanager
 def naming_the_adjoint() -> Iterator[None]:
-    """Context in which JAX's refusal of a forward mode names the option that forbids it."""
+    """Context in which JAX's refusal of a forward mode names the option that forbids
+    it.
+    """
     try:
         yield
     except TypeError as error:
@@ -99,18 +115,21 @@ def naming_the_adjoint() -> Iterator[None]:
 def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
     """`function(argument)` with derivatives in both modes of every order.
 
-    Both are trees; arrays in them may have any shape. `vmap` makes it a batch of runs side by side,
-    as of any function.
+    Both are trees; arrays in them may have any shape. `vmap` makes it a batch of runs
+    side by side, as of any function.
     """
     leaves, tree = jax.tree.flatten(argument)
-    others = [None if eqx.is_array(x) else x for x in leaves]  # leaves that are no arrays
+    # leaves that are no arrays
+    others = [None if eqx.is_array(x) else x for x in leaves]
     trees: list[Any] = []
 
     def of_arrays(*arrays: jax.Array) -> Arrays:
         """The leaves of the result, from the arrays in the argument."""
         values = iter(arrays)
         rebuilt = [next(values) if x is None else x for x in others]
-        results, result_tree = jax.tree.flatten(function(jax.tree.unflatten(tree, rebuilt)))
+        results, result_tree = jax.tree.flatten(
+            function(jax.tree.unflatten(tree, rebuilt))
+        )
         trees[:] = [result_tree]
         return tuple(results)
 
@@ -129,7 +148,9 @@ def without_derivatives(values: Any, why: Exception) -> Any:
         return numbers
 
     def rule(primals: Any, tangents: Any) -> Any:
-        """The values and their tangents of 0; raises `why` where a tangent is not known to be 0."""
+        """The values and their tangents of 0; raises `why` where a tangent is not known
+        to be 0.
+        """
         rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
         if any(not isinstance(rate, SymbolicZero) for rate in rates):
             raise why
@@ -155,10 +176,11 @@ class _OneLane:
 
 @dataclasses.dataclass(frozen=True)
 class _WithTangents:
-    """Results (.., B) of a function f, then rates `sum_i (df / dx_i) t_i` of the smooth ones.
+    """Results (.., B) of a function f, then rates `sum_i (df / dx_i) t_i` of the smooth
+    ones.
 
-    Arguments: those of the function, then tangents t_i of those `marked`. With `many`, tangents and
-    rates have an axis of D directions in front: (D, .., B).
+    Arguments: those of the function, then tangents t_i of those `marked`. With `many`,
+    tangents and rates have an axis of D directions in front: (D, .., B).
     """
 
     function: Function
@@ -167,26 +189,38 @@ class _WithTangents:
 
     def results(self, *kinds: Kind) -> Iterator[Kind]:
         """Kinds of the results of the function, then of the rates."""
-        at, directions = kinds[: len(self.marked)], kinds[len(self.marked) :]
-        many = directions[0].shape[:1] if self.many else ()
+        at = kinds[: len(self.marked)]
+        directions = kinds[len(self.marked) :]
+        if self.many:
+            many = directions[0].shape[:1]
+        else:
+            many = ()
         return _with_rates(results_of(self.function, *at), many)
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
-        """f(x), then the rates `sum_i (df / dx_i) t_i` in each direction t (a tangent of JAX)."""
-        values, directions = arrays[: len(self.marked)], arrays[len(self.marked) :]
+        """f(x), then the rates `sum_i (df / dx_i) t_i` in each direction t (a tangent
+        of JAX).
+        """
+        values = arrays[: len(self.marked)]
+        directions = arrays[len(self.marked) :]
         if not self.many:
             directions = tuple(x[None] for x in directions)
         # a function that takes `Dual`s pushes tangents through its loops itself
-        push = _push_duals if getattr(self.function, "takes_duals", False) else _push
+        if getattr(self.function, "takes_duals", False):
+            push = _push_duals
+        else:
+            push = _push
         outs, rates = push(self.function, self.marked, values, directions)
         return *outs, *(rates if self.many else (x[0] for x in rates))
 
 
 @dataclasses.dataclass(frozen=True)
 class _WithJacobian:
-    """Results (.., B) of a function f, then rates (D, .., B) of the smooth ones: their Jacobian.
+    """Results (.., B) of a function f, then rates (D, .., B) of the smooth ones: their
+    Jacobian.
 
-    D counts the entries of the `marked` arguments in a lane: rate d is the derivative in entry d.
+    D counts the entries of the `marked` arguments in a lane: rate d is the derivative
+    in entry d.
     """
 
     function: Function
@@ -194,11 +228,15 @@ class _WithJacobian:
 
     def results(self, *kinds: Kind) -> Iterator[Kind]:
         """Kinds of the results of the function, then of the rates."""
-        count = sum(math.prod(kind.shape) for kind, mark in zip(kinds, self.marked) if mark)
+        count = sum(
+            math.prod(kind.shape) for kind, mark in zip(kinds, self.marked) if mark
+        )
         return _with_rates(results_of(self.function, *kinds), (count,))
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
-        """f(x), then its Jacobian: rates along the unit vectors, DIRECTIONS of them in each run."""
+        """f(x), then its Jacobian: rates along the unit vectors, DIRECTIONS of them in
+        each run.
+        """
         push = _WithTangents(self.function, self.marked, many=True)
         moving = [x for x, mark in zip(arrays, self.marked) if mark]
         sizes = [math.prod(x.shape[:-1]) for x in moving]
@@ -207,8 +245,11 @@ class _WithJacobian:
         unit = jnp.eye(count * size, sum(sizes), dtype=moving[0].dtype)
 
         def along(rows: Float[Array, "d D"]) -> tuple[Arrays, Arrays]:
-            """Results, and rates (d, .., B) in d directions, given by entries in all arguments."""
-            directions, first = [], 0
+            """Results, and rates (d, .., B) in d directions, given by entries in all
+            arguments.
+            """
+            directions = []
+            first = 0
             for x, n in zip(moving, sizes):  # entries first .. first + n are those of x
                 own = rows[:, first : first + n].reshape(len(rows), *x.shape[:-1], 1)
                 own = jnp.broadcast_to(own, (len(rows), *x.shape))
@@ -227,13 +268,19 @@ class _WithJacobian:
 
 
 def _with_rates(results: tuple[Kind, ...], many: tuple[int, ...]) -> Iterator[Kind]:
-    """Kinds of results, then of the rates of the smooth ones, with the axes `many` in front."""
+    """Kinds of results, then of the rates of the smooth ones, with the axes `many` in
+    front.
+    """
     yield from results
-    yield from (kind._replace(shape=(*many, *kind.shape)) for kind in results if kind.smooth)
+    yield from (
+        kind._replace(shape=(*many, *kind.shape)) for kind in results if kind.smooth
+    )
 
 
 def _count_of_values(outs: Arrays) -> int:
-    """Number of the results in a list of results and rates, in which each smooth one has a rate."""
+    """Number of the results in a list of results and rates, in which each smooth one
+    has a rate.
+    """
     smooth = [is_smooth(x) for x in outs]
     return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
 
@@ -241,15 +288,19 @@ def _count_of_values(outs: Arrays) -> int:
 def _push(
     function: Function, marked: tuple[bool, ...], arrays: Arrays, directions: Arrays
 ) -> tuple[Arrays, Arrays]:
-    """Results, and rates (d, .., B) of the smooth ones along d directions of the `marked` arrays.
+    """Results, and rates (d, .., B) of the smooth ones along d directions of the
+    `marked` arrays.
 
-    Equation: `rate = sum_i (df / dx_i) t_i`, by one forward derivative (jvp) for each direction.
+    Equation: `rate = sum_i (df / dx_i) t_i`, by one forward derivative (jvp) for each
+    direction.
     """
 
     def of_marked(*values: jax.Array) -> Arrays:
         """`function` of its marked arguments, the others as they are."""
         replaced = iter(values)
-        return tuple(function(*(next(replaced) if m else x for x, m in zip(arrays, marked))))
+        return tuple(
+            function(*(next(replaced) if m else x for x, m in zip(arrays, marked)))
+        )
 
     def one(*directions: jax.Array) -> tuple[Arrays, Arrays]:
         """Results, and rates (.., B) of the smooth ones, in one direction."""
@@ -268,12 +319,16 @@ def _push_duals(
     duals = [Dual(x, next(inner)) if mark else x for x, mark in zip(arrays, marked)]
     outs = tuple(function(*duals))
     smooth = [dual_like(duals, x) for x in outs if is_dual(x) or is_smooth(x)]
-    return value_of(outs), tuple(jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in smooth)
+    return value_of(outs), tuple(
+        jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in smooth
+    )
 
 
 @functools.cache
 def _differentiable_lanes(function: Function, fine: Function, adjoint: str) -> Function:
-    """`function` in lanes with the derivatives of `fine`, made once for equal functions."""
+    """`function` in lanes with the derivatives of `fine`, made once for equal
+    functions.
+    """
     return _differentiable(_lanes(function), fine, adjoint, _differentiable_lanes)
 
 
@@ -283,19 +338,27 @@ def _as_it_is(function: Function, fine: Function, adjoint: str) -> Function:
 
 
 def _differentiable(
-    run: Function, fine: Function, adjoint: str, again: Callable[[Any, Any, str], Function]
+    run: Function,
+    fine: Function,
+    adjoint: str,
+    again: Callable[[Any, Any, str], Function],
 ) -> Function:
-    """`run` with the derivatives of `fine`, to which `again` gives derivatives of their own."""
+    """`run` with the derivatives of `fine`, to which `again` gives derivatives of their
+    own.
+    """
 
     @jax.custom_jvp
     def value(*arrays: jax.Array) -> Arrays:
         """The results of `run`."""
         return full_precision(run)(*arrays)
 
-    def derivative(kind: Any, marked: tuple[bool, ...], *arrays: jax.Array) -> tuple[Arrays, Any]:
+    def derivative(
+        kind: Any, marked: tuple[bool, ...], *arrays: jax.Array
+    ) -> tuple[Arrays, Any]:
         """Results of `fine` and their rates, both with derivatives again.
 
-        `kind`: `_WithTangents` (arrays: arguments, tangents) or `_WithJacobian` (arguments).
+        `kind`: `_WithTangents` (arrays: arguments, tangents) or `_WithJacobian`
+        (arguments).
         """
         with_rates = kind(fine, marked)
         outs = again(with_rates, with_rates, adjoint)(*arrays)
@@ -303,8 +366,12 @@ def _differentiable(
         return outs[:count], iter(outs[count:])
 
     @full_precision
-    def rule(primals: Arrays, tangents: tuple[Any, ...]) -> tuple[Arrays, tuple[Any, ...]]:
-        """Results of `fine` and their tangents: Jacobian times direction, or `forward` along it."""
+    def rule(
+        primals: Arrays, tangents: tuple[Any, ...]
+    ) -> tuple[Arrays, tuple[Any, ...]]:
+        """Results of `fine` and their tangents: Jacobian times direction, or `forward`
+        along it.
+        """
         marked = tuple(not isinstance(t, SymbolicZero) for t in tangents)
         moving = [t for t, mark in zip(tangents, marked) if mark]
         if isinstance(fine, _WithTangents):
@@ -324,20 +391,26 @@ def _differentiable(
 def _second_order(
     first: _WithTangents, marked: tuple[bool, ...], primals: Arrays, moving: Arrays
 ) -> tuple[Arrays, tuple[Any, ...]]:
-    """Results of `first`, and their tangents: derivatives of its product with the Jacobian.
+    """Results of `first`, and their tangents: derivatives of its product with the
+    Jacobian.
 
-    `first` is f'(x) t; its tangent is that of `J(x) t`, with J a function that has derivatives.
+    `first` is f'(x) t; its tangent is that of `J(x) t`, with J a function that has
+    derivatives.
     """
 
     def by_jacobian(*values: jax.Array) -> tuple[Arrays, Arrays]:
-        """Smooth results of `first`, then all, at its `marked` arguments x and t: `J(x) t`."""
+        """Smooth results of `first`, then all, at its `marked` arguments x and t:
+        `J(x) t`.
+        """
         replaced = iter(values)
         arrays = [next(replaced) if mark else x for x, mark in zip(primals, marked)]
         count = len(first.marked)
         jacobian = _WithJacobian(first.function, first.marked)
         outs = _differentiable_lanes(jacobian, jacobian, "jacobian")(*arrays[:count])
         n = _count_of_values(outs)
-        direction = jnp.concatenate([t.reshape(-1, t.shape[-1]) for t in arrays[count:]])
+        direction = jnp.concatenate(
+            [t.reshape(-1, t.shape[-1]) for t in arrays[count:]]
+        )
         whole = *outs[:n], *(_contracted(x, direction) for x in outs[n:])
         return tuple(x for x in whole if is_smooth(x)), whole
 
@@ -347,7 +420,9 @@ def _second_order(
 
 
 def _with_zeros(outs: Arrays, rates: Iterator[jax.Array]) -> tuple[Any, ...]:
-    """Tangents of all results: the `rates` of the smooth ones, symbolic zeros of the others."""
+    """Tangents of all results: the `rates` of the smooth ones, symbolic zeros of the
+    others.
+    """
     none = (SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in outs)
     return tuple(next(rates) if is_smooth(x) else zero for x, zero in zip(outs, none))
 
@@ -355,13 +430,17 @@ def _with_zeros(outs: Arrays, rates: Iterator[jax.Array]) -> tuple[Any, ...]:
 def _contracted(
     rates: Float[Array, "D *rows B"], direction: Float[Array, "D B"]
 ) -> Float[Array, "*rows B"]:
-    """Tangent `sum_d rates_d direction_d` of a result: its Jacobian times a direction."""
+    """Tangent `sum_d rates_d direction_d` of a result: its Jacobian times a
+    direction.
+    """
     return jnp.einsum("d...b,db->...b", rates, direction)
 
 
 @functools.cache
 def _reversible(function: Function, fine: Function) -> Function:
-    """`function` in lanes; for derivatives `fine` as it is, with the reverse mode of its loops."""
+    """`function` in lanes; for derivatives `fine` as it is, with the reverse mode of
+    its loops.
+    """
 
     @jax.custom_vjp
     def value(*arrays: jax.Array) -> Arrays:
@@ -370,7 +449,9 @@ def _reversible(function: Function, fine: Function) -> Function:
 
     @full_precision
     def forward(*arrays: jax.Array) -> tuple[Arrays, Any]:
-        """Results of `fine`, and the product of cotangents with its transposed Jacobian."""
+        """Results of `fine`, and the product of cotangents with its transposed
+        Jacobian.
+        """
         if hasattr(fine, "only_first"):
             arrays = fine.only_first(arrays)
 
@@ -396,16 +477,20 @@ def _chunk_of(function: Any) -> int:
     while isinstance(function, _WithTangents | _WithJacobian):
         function = function.function
     if getattr(function, "queues", False):
-        return QUEUE_WITH_TANGENTS if tangents else QUEUE
-    return CHUNK_WITH_TANGENTS if tangents else CHUNK
+        if tangents:
+            return QUEUE_WITH_TANGENTS
+        return QUEUE
+    if tangents:
+        return CHUNK_WITH_TANGENTS
+    return CHUNK
 
 
 @functools.cache
 def _lanes(function: Function) -> Function:
     """`function` as one operation of JAX, of arrays whose last axis is that of a batch.
 
-    `vmap` makes this axis longer. Only where the operation is compiled is `function` traced, once,
-    at the batch that there is.
+    `vmap` makes this axis longer. Only where the operation is compiled is `function`
+    traced, once, at the batch that there is.
     """
 
     def bind(*arrays: jax.Array) -> Arrays:
@@ -420,11 +505,15 @@ def _lanes(function: Function) -> Function:
 
 @functools.cache
 def results_of(function: Function, *kinds: Kind) -> tuple[Kind, ...]:
-    """Kinds of the results at arguments of these `kinds`: as the function says, or by a trace."""
+    """Kinds of the results at arguments of these `kinds`: as the function says, or by a
+    trace.
+    """
     if hasattr(function, "results"):
         return tuple(function.results(*kinds))
     one = [jax.ShapeDtypeStruct((*kind.shape, 1), kind.dtype) for kind in kinds]
-    return tuple(Kind(x.shape[:-1], x.dtype) for x in jax.eval_shape(_compiled(function), *one))
+    return tuple(
+        Kind(x.shape[:-1], x.dtype) for x in jax.eval_shape(_compiled(function), *one)
+    )
 
 
 @functools.cache
@@ -448,16 +537,22 @@ mlir.register_lowering(_lanes_p, mlir.lower_fun(_run_lanes, multiple_results=Tru
 
 
 def _kinds_of_results(*arguments: Any, function: Function, results: Any) -> list[Any]:
-    """Abstract arrays of the results: their kinds with the batch of the arguments behind."""
+    """Abstract arrays of the results: their kinds with the batch of the arguments
+    behind.
+    """
     first = arguments[0]
     batch = first.shape[-1]
 
     def like_first(kind: Kind) -> Any:
-        """An array of this kind that varies over the same axes of a mesh as the first argument."""
+        """An array of this kind that varies over the same axes of a mesh as the first
+        argument.
+        """
         shape = (*kind.shape, batch)
         whole = jax.sharding.PartitionSpec(*[None] * len(shape))
         sharding = jax.sharding.NamedSharding(first.sharding.mesh, whole)
-        return first.update(shape=shape, dtype=kind.dtype, weak_type=False, sharding=sharding)
+        return first.update(
+            shape=shape, dtype=kind.dtype, weak_type=False, sharding=sharding
+        )
 
     return [like_first(kind) for kind in results]
 
@@ -468,17 +563,25 @@ _lanes_p.def_abstract_eval(_kinds_of_results)
 def _batching_rule(
     arrays: Any, axes: Any, *, function: Function, results: Any
 ) -> tuple[Arrays, tuple[Any, ...]]:
-    """Rule of `vmap` for `_lanes_p`: the results, and the axis of their batch (None: no batch).
+    """Rule of `vmap` for `_lanes_p`: the results, and the axis of their batch (None: no
+    batch).
 
-    `axes`: of the batch in each array, None where it has none. Arrays (.., B) with a batch of
-    `size` become (.., size B), and the results are split again. But a batch of tangents alone, at
-    values that have none, becomes the directions of `_WithTangents`, which computes values once.
+    `axes`: of the batch in each array, None where it has none. Arrays (.., B) with a
+    batch of `size` become (.., size B), and the results are split again. But a batch of
+    tangents alone, at values that have none, becomes the directions of `_WithTangents`,
+    which computes values once.
     """
     batched = [axis is not None for axis in axes]
     size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
-    arrays = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes)]
+    arrays = [
+        x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes)
+    ]
     count = len(getattr(function, "marked", ()))  # of values, before their tangents
-    if isinstance(function, _WithTangents) and not function.many and not any(batched[:count]):
+    if (
+        isinstance(function, _WithTangents)
+        and not function.many
+        and not any(batched[:count])
+    ):
         # many directions at one point: its steps are computed once
         along = [
             x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
@@ -489,7 +592,9 @@ def _batching_rule(
         return outs, tuple(None if i < values else 0 for i in range(len(outs)))
 
     def wide(x: Shaped[Array, "..."], is_batched: bool) -> Shaped[Array, "..."]:
-        """An array with the batch of `vmap` and its own, one after the other, in its last axis."""
+        """An array with the batch of `vmap` and its own, one after the other, in its
+        last axis.
+        """
         if is_batched:
             x = jnp.moveaxis(x, 0, -2)
         else:
@@ -506,7 +611,9 @@ batching.primitive_batchers[_lanes_p] = _batching_rule
 
 @full_precision
 def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
-    """Results of a function: chunk after chunk of the batch on a CPU, all at once elsewhere."""
+    """Results of a function: chunk after chunk of the batch on a CPU, all at once
+    elsewhere.
+    """
     size = arrays[0].shape[-1]
     count = -(-size // _chunk_of(function))
     if count == 1:
@@ -518,15 +625,21 @@ def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
 
         def cut(x: Shaped[Array, "*rows B"]) -> Shaped[Array, "count *rows width"]:
             """Chunks of the batch, the last one filled up with its last impact."""
-            filled = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge")
+            filled = jnp.pad(
+                x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge"
+            )
             return jnp.moveaxis(filled.reshape(*x.shape[:-1], count, width), -2, 0)
 
         def join(x: Shaped[Array, "count *rows width"]) -> Shaped[Array, "*rows B"]:
-            """The chunks side by side, without what fills up the last one: the inverse of `cut`."""
+            """The chunks side by side, without what fills up the last one: the inverse
+            of `cut`.
+            """
             joined = jnp.moveaxis(x, 0, -2)
             return joined.reshape(*joined.shape[:-2], count * width)[..., :size]
 
-        mapped = jax.lax.map(lambda piece: tuple(function(*piece)), tuple(map(cut, whole)))
+        mapped = jax.lax.map(
+            lambda piece: tuple(function(*piece)), tuple(map(cut, whole))
+        )
         return tuple(map(join, mapped))
 
     return jax.lax.platform_dependent(

@@ -1,4 +1,6 @@
-"""Vectors of N states of m contacts in their planes: lengths, directions, discs of friction."""
+"""Vectors of N states of m contacts in their planes: lengths, directions, discs of
+friction.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,7 +16,10 @@ def over(
     vectors: Float[Array, "m rows N"], length: Float[Array, "m #N"]
 ) -> Float[Array, "m rows N"]:
     """Vectors over lengths, v / length; 0 where the length is 0."""
-    return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None] * vectors
+    return (
+        jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None]
+        * vectors
+    )
 
 
 def in_disc(
@@ -22,4 +27,6 @@ def in_disc(
 ) -> Float[Array, "m rows N"]:
     """Projections on discs: the points with |v| <= radius nearest to `side`."""
     length = length_of(side)
-    return jnp.where((length > radius)[:, None], over(side, length) * radius[:, None], side)
+    return jnp.where(
+        (length > radius)[:, None], over(side, length) * radius[:, None], side
+    )

@@ -1,4 +1,6 @@
-"""The loop of impacts and motions: side by side, or in a queue with room for the next one."""
+"""The loop of impacts and motions: side by side, or in a queue with room for the next
+one.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -10,16 +12,19 @@ from jaxtyping import Array, Bool, Int
 
 from jimpact.tools.loops import while_loop
 
-# Impacts that a CPU computes side by side: 128 and 512 take a tenth longer. Ten times more: stages
-# leave a core's cache; ten times fewer: each operation has too few numbers to work on.
+# Impacts that a CPU computes side by side: 128 and 512 take a tenth longer. Ten times
+# more: stages leave a core's cache; ten times fewer: each operation has too few numbers
+# to work on.
 SLOTS = 256
 SLOTS_WITH_TANGENTS = 128  # of impacts with tangents, which take more room in the cache
-SLOTS_IN_SPACE = 64  # with friction in space, where some take many times the passes of others
-# Part of the slots that are free before they are filled with waiting impacts. Ten times more: all
-# wait for the slowest impact again; ten times less: copying what enters takes longer than a pass.
+# with friction in space, where some take many times the passes of others
+SLOTS_IN_SPACE = 64
+# Part of the slots that are free before they are filled with waiting impacts. Ten times
+# more: all wait for the slowest impact again; ten times less: copying what enters takes
+# longer than a pass.
 FREE = 1 / 16
-# States that the reverse mode of a loop keeps at a time. Ten times more: ten times its memory; ten
-# times fewer: steps are run again more often.
+# States that the reverse mode of a loop keeps at a time. Ten times more: ten times its
+# memory; ten times fewer: steps are run again more often.
 CHECKPOINTS = 64
 
 Carry = TypeVar("Carry")
@@ -43,12 +48,13 @@ def until_over(
     checkpoints: bool = False,
     slots: int | None = None,
 ) -> Carry:
-    """States of all impacts, or of one motion, at their ends: passes until none goes on.
+    """States of all impacts, or of one motion, at their ends: passes until none goes
+    on.
 
-    `goes_on(flow, carry)` is a mask (1, B) of those that are not over, `advance(flow, carry)` makes
-    one pass; the batch B of impacts is the last axis of all arrays. With `checkpoints` the loop has
-    a reverse mode, in the place of a forward mode. A CPU has at most so many `slots` of impacts
-    side by side; None: all.
+    `goes_on(flow, carry)` is a mask (1, B) of those that are not over,
+    `advance(flow, carry)` makes one pass; the batch B of impacts is the last axis of
+    all arrays. With `checkpoints` the loop has a reverse mode, in the place of a
+    forward mode. A CPU has at most so many `slots` of impacts side by side; None: all.
     """
 
     def at_once(flow: Any, carry: Any) -> Any:
@@ -60,7 +66,9 @@ def until_over(
 
         if checkpoints:
             one = lambda carry: advance(flow, carry)  # noqa: E731
-            return eqxi.while_loop(busy, one, carry, kind="checkpointed", checkpoints=CHECKPOINTS)
+            return eqxi.while_loop(
+                busy, one, carry, kind="checkpointed", checkpoints=CHECKPOINTS
+            )
         return while_loop(busy, lambda carry: advance(flow, carry), carry)
 
     def in_slots(flow: Any, carry: Any) -> Any:
@@ -80,7 +88,9 @@ def _in_slots(
     carry: Any,
     size: int,
 ) -> Any:
-    """The ends of more impacts than `size` slots: where one is over, the next one enters."""
+    """The ends of more impacts than `size` slots: where one is over, the next one
+    enters.
+    """
     count = jax.tree.leaves(carry)[0].shape[-1]
     most_free = max(1, round(FREE * size))
 
@@ -90,12 +100,15 @@ def _in_slots(
 
     def stored(s: _Slots) -> Any:
         """The states of all impacts, those in slots as they are now."""
-        return jax.tree.map(lambda x, new: x.at[..., s.impact].set(new), s.ends, s.carry)
+        return jax.tree.map(
+            lambda x, new: x.at[..., s.impact].set(new), s.ends, s.carry
+        )
 
     def refilled(s: _Slots) -> _Slots:
         """The slots with the next waiting impacts in place of those that are over."""
         free = ~goes_on(s.flow, s.carry)[0]
-        # the first free slot gets the impact `following`, the second the one after it, ..
+        # the first free slot gets the impact `following`, the second the one after it,
+        # ..
         next_one = s.following + jnp.cumsum(free, dtype=jnp.int32) - 1
         enters = free & (next_one < count)
         impact = jnp.where(enters, next_one, s.impact)
@@ -105,10 +118,14 @@ def _in_slots(
         return _Slots(impact, following, new_flow, new, stored(s))
 
     def next_round(s: _Slots) -> _Slots:
-        """The slots after passes until enough of them are free, which are then filled."""
+        """The slots after passes until enough of them are free, which are then
+        filled.
+        """
 
         def continues(carry: Any) -> Bool[Array, ""]:
-            """True while too few slots are free to fill them, or some are busy at the end."""
+            """True while too few slots are free to fill them, or some are busy at the
+            end.
+            """
             busy = jnp.sum(goes_on(s.flow, carry), dtype=jnp.int32)
             return busy > jnp.where(s.following < count, size - most_free, 0)
 

@@ -1,15 +1,18 @@
-"""Coulomb friction: which contacts stick, which slide and where to. Planar is a disc of one row.
+"""Coulomb friction: which contacts stick, which slide and where to. Planar is a disc of
+one row.
 
-With A = D^T M^-1 D of the normals and tangents D = [N, H] and x = (p, p_t) the question is
+With A = D^T M^-1 D of the normals and tangents D = [N, H] and x = (p, p_t) the question
+is
 
-    normal      r = a + A_n x:  r = 0 (prescribed), or  0 <= r _|_ p >= 0 (complementary)
-    tangential  s = b + A_t x,  p_t in -mu max(p, 0) Sgn(s)
+    normal      r = a + A_n x:  r = 0 (prescribed), or  0 <= r _|_ p >= 0
+    (complementary) tangential  s = b + A_t x,  p_t in -mu max(p, 0) Sgn(s)
 
-for impulses and velocities, or for forces and accelerations. Each contact is free (p = 0, or it
-pulls; p_t = 0), sticks (s = 0) or slides (p_t = -mu p d, d = s / |s|). These modes are found with
-derivatives switched off; linear solves on them then give values and derivatives. Where A is
-singular on the modes (both corners of a block lying flat), sticking contacts share what they hold
-in proportion to mu p, and normal impulses are the least, wherever that is allowed.
+for impulses and velocities, or for forces and accelerations. Each contact is free (p =
+0, or it pulls; p_t = 0), sticks (s = 0) or slides (p_t = -mu p d, d = s / |s|). These
+modes are found with derivatives switched off; linear solves on them then give values
+and derivatives. Where A is singular on the modes (both corners of a block lying flat),
+sticking contacts share what they hold in proportion to mu p, and normal impulses are
+the least, wherever that is allowed.
 """
 
 import itertools
@@ -20,9 +23,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.numerics.dense import block_inverse, block_solve, load_shares, singular_values, times
+from jimpact.numerics.dense import (
+    block_inverse,
+    block_solve,
+    load_shares,
+    singular_values,
+    times,
+)
 from jimpact.numerics.discs import in_disc, length_of, over
-from jimpact.numerics.interior_points import ATTEMPTS, Best, better, cones_of, within_cones
+from jimpact.numerics.interior_points import (
+    ATTEMPTS,
+    Best,
+    better,
+    cones_of,
+    within_cones,
+)
 from jimpact.numerics.lcp import gathered_rounding
 from jimpact.numerics.many_contacts import solve_many
 from jimpact.tools.compiling import full_precision
@@ -30,45 +45,54 @@ from jimpact.tools.loops import fori_loop, while_loop
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
-ENUMERATED = 3  # contacts up to which all modes are tried: 4^3 in the plane, 6^3 in space
-_DIRECTIONS = 4  # directions of slip, evenly spread, that each sliding contact in space starts from
+# contacts up to which all modes are tried: 4^3 in the plane, 6^3 in space
+ENUMERATED = 3
+# directions of slip, evenly spread, that each sliding contact in space starts from
+_DIRECTIONS = 4
 _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usual
-# Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
-# takes a visible share.
+# Part of the largest mu p: the weight in the sharing of a contact without load. Ten
+# times more: it takes a visible share.
 _LEAST_SHARE = 1e-6
-# Projections at most, where interior points find nothing, and at most for each contact, if that is
-# more. Ten times more: jammed scenes end later.
-_PROJECTIONS, _PROJECTIONS_EACH = 5000, 20
-_POLISHES = 8  # steps of Newton's method; 1 to 3 are usual, ten times more change nothing
-# Added to the diagonal of the equations of Newton's method, which are singular where impulses are
-# free. Ten times more: another step of it.
+# Projections at most, where interior points find nothing, and at most for each contact,
+# if that is more. Ten times more: jammed scenes end later.
+_PROJECTIONS = 5000
+_PROJECTIONS_EACH = 20
+# steps of Newton's method; 1 to 3 are usual, ten times more change nothing
+_POLISHES = 8
+# Added to the diagonal of the equations of Newton's method, which are singular where
+# impulses are free. Ten times more: another step of it.
 _RIDGE = 1e-8
-# Rows of the equations up to which free impulses are shared out, by their singular values. Ten
-# times more: a minute for an impact.
+# Rows of the equations up to which free impulses are shared out, by their singular
+# values. Ten times more: a minute for an impact.
 _SHARED = 256
-# `distribute`: sweeps at most; part of the largest limit below which a sweep changes nothing; part
-# of the limit below which a force is inside its disc, or a rate is 0. Ten times more of the last
-# two: contacts on the rim of their cone stick.
+# `distribute`: sweeps at most; part of the largest limit below which a sweep changes
+# nothing; part of the limit below which a force is inside its disc, or a rate is 0. Ten
+# times more of the last two: contacts on the rim of their cone stick.
 _RELAXATIONS = 200
-_SETTLED, _INSIDE = 1e-13, 1e-9
+_SETTLED = 1e-13
+_INSIDE = 1e-9
 
 
 class FrictionImpulses(NamedTuple):
-    """Impulses x = (p, p_t), n = m + t of them, and how far they are unique; without derivatives.
+    """Impulses x = (p, p_t), n = m + t of them, and how far they are unique; without
+    derivatives.
 
-    Of up to 3 contacts there are other `shares`, s = 2 m, with the same velocities: those with the
-    least and the most p of each contact.
+    Of up to 3 contacts there are other `shares`, s = 2 m, with the same velocities:
+    those with the least and the most p of each contact.
     """
 
     normal: Float[Array, " m"]  # p
     tangential: Float[Array, " t"]  # p_t, t = m or 2 m
     status: Int[Array, ""]  # a code of `tools/status.py`
-    free: Float[Array, "n n"]  # columns in which they are free, p first; 0: they are unique
+    # columns in which they are free, p first; 0: they are unique
+    free: Float[Array, "n n"]
     shares: Float[Array, "s n"] | None
 
 
 class _FrictionProblem(NamedTuple):
-    """The problem above, contact-major, b = 1 + rows, scaled to a diagonal of order 1."""
+    """The problem above, contact-major, b = 1 + rows, scaled to a diagonal of order
+    1.
+    """
 
     matrix: Float[Array, "m b m b"]  # A
     rate: Float[Array, "m b"]  # (a, b)
@@ -108,33 +132,37 @@ def solve(
     `s = slip + A_t x`, `p_t in -mu max(p, 0) Sgn(s)`.
 
     Args:
-        matrix: A, n = m + t rows, normals first, then the t = m (planar) or 2 m tangents,
-            contact-major. A contact that takes no part has rows and columns of a unit matrix.
+        matrix: A, n = m + t rows, normals first, then the t = m (planar) or 2 m
+            tangents, contact-major. A contact that takes no part has rows and columns
+            of a unit matrix.
         normal: what gamma+ - gamma- must make up for; the same for accelerations.
         slip: `(1 + e_t) u-`.
         friction: mu.
         complementary: contacts may part; otherwise they may pull (without friction).
-        load: >= 0, normal impulses in addition to p, which friction includes: it is bounded by
-            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0. One below rounding counts
-            as one that begins: where p = 0 = r, derivatives are those of a contact that opens.
+        load: >= 0, normal impulses in addition to p, which friction includes: it is
+            bounded by `mu (p + load)`, and acts on contacts with p = 0 too. None: 0.
+            One below rounding counts as one that begins: where p = 0 = r, derivatives
+            are those of a contact that opens.
         sliding: unit vectors of slip where it is known (forces of contacts that slide
-            already: s, an acceleration, does not decide), 0 where it is unknown. Not together
-            with `load`.
+            already: s, an acceleration, does not decide), 0 where it is unknown. Not
+            together with `load`.
 
     Returns:
-        p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are tried, and
-        consistent ones whose velocities differ were found; the one with most sticking contacts is
-        returned. In space Newton's method looks for the directions of slip from 4 starts a contact,
-        all combined: solutions that none of them reaches are missed. Above 3 contacts other modes
-        are not looked for. It is reported also where redundant contacts slide, so that how they
-        share p changes their slip (a spinning cube flat on four corners).
-        `impulse_not_unique`: only the impulses differ; of more than 256 rows no shares are
-        computed, nor whether slip depends on them. `infeasible`: no modes are consistent;
+        p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are
+        tried, and consistent ones whose velocities differ were found; the one with most
+        sticking contacts is returned. In space Newton's method looks for the directions
+        of slip from 4 starts a contact, all combined: solutions that none of them
+        reaches are missed. Above 3 contacts other modes are not looked for. It is
+        reported also where redundant contacts slide, so that how they share p changes
+        their slip (a spinning cube flat on four corners).
+        `impulse_not_unique`: only the impulses differ; of more than 256 rows no shares
+        are computed, nor whether slip depends on them. `infeasible`: no modes are
+        consistent;
         `max_steps`: none were found (in space, above 3 contacts).
 
-    Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
-    about to change, and take a singular matrix to keep its rank; those of impulses that are not
-    unique hold the directions in which they are free.
+    Derivatives (up to the third, in any mode) hold the modes, which is one-sided where
+    they are about to change, and take a singular matrix to keep its rank; those of
+    impulses that are not unique hold the directions in which they are free.
 
     Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247 (planar existence).
 
@@ -150,18 +178,23 @@ def solve(
     m = len(normal)
     rows = len(slip) // m
     # rows of A (m, b) of each contact: its normal, then its tangents
-    order = np.concatenate([np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1)
+    order = np.concatenate(
+        [np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1
+    )
     of_contacts = matrix[order[:, :, None, None], order[None, None]]
     # unknowns are scaled to a diagonal of 1, both tangents of a contact alike
     squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
     squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
-    scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows)
+    scale = 1 / jnp.repeat(
+        norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows
+    )
     rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
     friction = friction * norm[:, 1] / norm[:, 0]
     of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
     drag = jnp.zeros((m, rows), matrix.dtype)  # p_t / p of contacts whose slip is known
-    if sliding is not None:  # their p_t = drag p moves into the column of p; unit rows of p_t
+    # their p_t = drag p moves into the column of p; unit rows of p_t
+    if sliding is not None:
         slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
         drag = -friction[:, None] * sliding.reshape(m, rows)
         dragged = jnp.sum(of_contacts[..., 1:] * drag[None, None], axis=3)
@@ -188,16 +221,24 @@ def solve(
     free, code = _freedom(fixed, inverted)
     status = jnp.maximum(decision.status, code)
     x = _on_modes(problem, modes, inverted, decided)
-    missed = _misfit(fixed, jax.lax.stop_gradient(x)[..., None], _size(decided[..., None]))[0]
+    missed = _misfit(
+        fixed, jax.lax.stop_gradient(x)[..., None], _size(decided[..., None])
+    )[0]
     wrong = ~(missed <= fixed.tolerance)
     status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
     x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
-    p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
+    # rounding
+    if complementary:
+        p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0])
+    else:
+        p = x[:, 0]
     free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
     free = _normals_first(free)
     shares = None
     if decision.others is not None:
-        shares = _normals_first(jax.lax.stop_gradient(scale * size)[..., None] * decision.others).T
+        shares = _normals_first(
+            jax.lax.stop_gradient(scale * size)[..., None] * decision.others
+        ).T
     return FrictionImpulses(p, x[:, 1:].reshape(-1), status, free, shares)
 
 
@@ -207,25 +248,34 @@ class _Decision(NamedTuple):
     modes: _Modes  # N = 1
     impulse: Float[Array, "m b"]  # x on them
     status: Int[Array, ""]
-    others: Float[Array, "m b s"] | None  # with the least and the most p of each contact, s = 2 m
+    # with the least and the most p of each contact, s = 2 m
+    others: Float[Array, "m b s"] | None
 
 
 def _normals_first(x: Float[Array, "m b N"]) -> Float[Array, "n N"]:
-    """Rows of contacts reordered: the normal of each, then the tangents, contact-major."""
+    """Rows of contacts reordered: the normal of each, then the tangents,
+    contact-major.
+    """
     return jnp.concatenate([x[:, 0], x[:, 1:].reshape(-1, x.shape[2])])
 
 
-# ------------------------------------------------------------------- the equations of modes
+# ------------------------------------------------------------------- the equations of
+# modes
 
 
-def _rates(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, "m b N"]:
+def _rates(
+    problem: _FrictionProblem, x: Float[Array, "m b N"]
+) -> Float[Array, "m b N"]:
     """Rates `(r, s) = (a, b) + A x` of N impulses x."""
     if len(x) <= ENUMERATED:
         return problem.rate[..., None] + _times(problem.matrix[..., None], x)
-    return problem.rate[..., None] + jnp.tensordot(problem.matrix, x, 2)  # never computed twice
+    # never computed twice
+    return problem.rate[..., None] + jnp.tensordot(problem.matrix, x, 2)
 
 
-def _times(matrix: Float[Array, "m b m b #N"], x: Float[Array, "m b N"]) -> Float[Array, "m b N"]:
+def _times(
+    matrix: Float[Array, "m b m b #N"], x: Float[Array, "m b N"]
+) -> Float[Array, "m b N"]:
     """Products `A x` of one or N matrices with N impulses x."""
     return jnp.sum(matrix * x[None, None], axis=(2, 3))
 
@@ -233,31 +283,44 @@ def _times(matrix: Float[Array, "m b m b #N"], x: Float[Array, "m b N"]) -> Floa
 def _bound(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, "m N"]:
     """Radii `mu (max(p, 0) + load)` of the discs of friction."""
     p = jnp.maximum(x[:, 0], 0.0)
-    return problem.friction[:, None] * (p if problem.load is None else p + problem.load[:, None])
+    return problem.friction[:, None] * (
+        p if problem.load is None else p + problem.load[:, None]
+    )
 
 
 def _rubs(problem: _FrictionProblem) -> Bool[Array, "m 1"]:
-    """Mask of contacts with friction: without it none sticks, also where it does not slip."""
+    """Mask of contacts with friction: without it none sticks, also where it does not
+    slip.
+    """
     return problem.friction[:, None] > 0
 
 
 def _size(x: Float[Array, "m b *N"]) -> Float[Array, "*N"]:
-    """Sizes `1 + max |x|` of one or N impulses; the rates without impulses have size 1."""
+    """Sizes `1 + max |x|` of one or N impulses; the rates without impulses have size
+    1.
+    """
     return 1 + jnp.abs(x).max(axis=(0, 1))
 
 
 def _misfit(
-    problem: _FrictionProblem, x: Float[Array, "m b N"], size: Float[Array, " N"] | None = None
+    problem: _FrictionProblem,
+    x: Float[Array, "m b N"],
+    size: Float[Array, " N"] | None = None,
 ) -> Float[Array, " N"]:
     """Largest violation of the law by x, as a part of the size of x.
 
-    Normal: |min(p, r)|, or |r| where r = 0 is prescribed; tangential: the distance of p_t from the
-    projection of p_t - s on the disc. Another `size` is given where impulses follow from x: they
-    must not hide their errors by growing.
+    Normal: |min(p, r)|, or |r| where r = 0 is prescribed; tangential: the distance of
+    p_t from the projection of p_t - s on the disc. Another `size` is given where
+    impulses follow from x: they must not hide their errors by growing.
     """
     rate = _rates(problem, x)
-    p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
-    normal = jnp.minimum(p, r) if problem.complementary else r
+    p = x[:, 0]
+    r = rate[:, 0]
+    side = x[:, 1:]
+    if problem.complementary:
+        normal = jnp.minimum(p, r)
+    else:
+        normal = r
     wrong = side - in_disc(side - rate[:, 1:], _bound(problem, x))
     most = jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1)))
     return most / (_size(x) if size is None else size)
@@ -270,17 +333,24 @@ def _equations(
 
         Q s + (1 - Q) p_t + mu (p + load) d = 0
 
-    with Q = 1 where a contact sticks and Q = 0 where it is free or slides along a fixed direction.
-    With Q = beta e e^T, e orthogonal to d, beta = mu p / (mu p + |s|), this is Newton's method for
-    the direction of slip.
+    with Q = 1 where a contact sticks and Q = 0 where it is free or slides along a fixed
+    direction. With Q = beta e e^T, e orthogonal to d, beta = mu p / (mu p + |s|), this
+    is Newton's method for the direction of slip.
     """
     m, rows = modes.direction.shape[:2]
     dtype = problem.matrix.dtype
-    q = modes.sticks[:, None, None].astype(dtype) * jnp.eye(rows, dtype=dtype)[None, ..., None]
+    q = (
+        modes.sticks[:, None, None].astype(dtype)
+        * jnp.eye(rows, dtype=dtype)[None, ..., None]
+    )
     if rows == 2:
         e = jnp.stack([-modes.direction[:, 1], modes.direction[:, 0]], axis=1)
         q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
-    q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0))).at[:, 0, 0].set(modes.taking.astype(dtype))
+    q = (
+        jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0)))
+        .at[:, 0, 0]
+        .set(modes.taking.astype(dtype))
+    )
     unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
     own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
     first = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
@@ -288,7 +358,8 @@ def _equations(
         modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0))
     )
     pressed = friction_direction[:, :, None, None] * own * first
-    # term by term: in single precision XLA may crash on sums within batches of so many axes
+    # term by term: in single precision XLA may crash on sums within batches of so many
+    # axes
     apart = (problem.matrix - unit)[..., None]
     # Q A + (1 - Q) = 1 + Q (A - 1)
     moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in range(1 + rows))
@@ -298,25 +369,33 @@ def _equations(
     return moved + pressed + unit[..., None], right
 
 
-def _turned(problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b N"]) -> _Modes:
-    """Modes with the directions `d = (s - p_t) / |s - p_t|` of slip that x has, in space.
+def _turned(
+    problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b N"]
+) -> _Modes:
+    """Modes with the directions `d = (s - p_t) / |s - p_t|` of slip that x has, in
+    space.
 
     `turning` is the beta of `_equations`.
     """
     if modes.direction.shape[1] == 1:
         return modes
     slip = _rates(problem, x)[:, 1:]
-    pull = slip - x[:, 1:]  # along d where a contact slides, and where it only reaches its cone
-    length, bound = length_of(pull), _bound(problem, x)
+    # along d where a contact slides, and where it only reaches its cone
+    pull = slip - x[:, 1:]
+    length = length_of(pull)
+    bound = _bound(problem, x)
     slides = (length_of(modes.direction) > 0) & (length > 0)
     direction = jnp.where(slides[:, None], over(pull, length), modes.direction)
     both = bound + length_of(slip)
-    turning = jnp.where(slides & (both > 0), bound / jnp.where(both > 0, both, 1.0), 0.0)
+    turning = jnp.where(
+        slides & (both > 0), bound / jnp.where(both > 0, both, 1.0), 0.0
+    )
     return modes._replace(direction=direction, turning=turning)
 
 
 def _solved(problem: _FrictionProblem, modes: _Modes) -> Float[Array, "m b N"]:
-    """Impulses x on modes, contact by contact; wrong where their equations are singular.
+    """Impulses x on modes, contact by contact; wrong where their equations are
+    singular.
 
     Refinements undo what `block_inverse` perturbs.
     """
@@ -334,30 +413,44 @@ def _solved(problem: _FrictionProblem, modes: _Modes) -> Float[Array, "m b N"]:
 
 
 def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """All combinations of modes (m, N), most sticking first: 0 sticks, 1 is free, 2, 3, .. slide.
+    """All combinations of modes (m, N), most sticking first: 0 sticks, 1 is free, 2, 3,
+    .. slide.
 
-    And the mask (m, N) of contacts with r = 0: all that are not free; with a load those may have
-    p = 0 instead, and none is free.
+    And the mask (m, N) of contacts with r = 0: all that are not free; with a load those
+    may have p = 0 instead, and none is free.
     """
-    slides = 2 if rows == 1 else _DIRECTIONS
+    if rows == 1:
+        slides = 2
+    else:
+        slides = _DIRECTIONS
     if not loaded:
         kinds = itertools.product(range(2 + slides), repeat=contacts)
-        table = np.array(sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))).T
+        table = np.array(
+            sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))
+        ).T
         return table, table != 1
-    each = [(kind, taking) for kind in (0, *range(2, 2 + slides)) for taking in (True, False)]
+    each = [
+        (kind, taking)
+        for kind in (0, *range(2, 2 + slides))
+        for taking in (True, False)
+    ]
     both = itertools.product(each, repeat=contacts)
     table = np.array(sorted(both, key=lambda k: sum((kind > 0) for kind, _ in k))).T
     return table[0], table[1] == 1
 
 
 def _enumerate(problem: _FrictionProblem) -> _Decision:
-    """The consistent modes that stick most, of all modes, and what other consistent ones give."""
-    m, rows = len(problem.friction), problem.rate.shape[1] - 1
+    """The consistent modes that stick most, of all modes, and what other consistent
+    ones give.
+    """
+    m = len(problem.friction)
+    rows = problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
     angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
     turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    # rotations (rows, rows, m, N) of the first direction, 0 where a contact does not slide
+    # rotations (rows, rows, m, N) of the first direction, 0 where a contact does not
+    # slide
     turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
@@ -371,13 +464,16 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
         jnp.zeros(kinds.shape, dtype),
     )
     modes, x = _newton(problem, modes)
-    misfit, root = _misfit(problem, x), precision(dtype).root
+    misfit = _misfit(problem, x)
+    root = precision(dtype).root
     # larger impulses are the rounding of a singular matrix
     good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
 
     def differ(values: Float[Array, "m b N"]) -> Bool[Array, ""]:
-        """True if these values of consistent modes differ from those of the chosen ones."""
+        """True if these values of consistent modes differ from those of the chosen
+        ones.
+        """
         apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
         return jnp.any(good & (apart > root * _size(x[..., best])))
 
@@ -388,10 +484,14 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
     signed = jnp.concatenate([x[:, 0], -x[:, 0]])  # p and -p (2 m, N)
     extreme = jnp.argmin(jnp.where(good, signed, jnp.inf), axis=1)
     others = x[..., jnp.where(jnp.any(good), extreme, best)]
-    return _Decision(chosen, x[..., best], jnp.where(jnp.any(good), status, none), others)
+    return _Decision(
+        chosen, x[..., best], jnp.where(jnp.any(good), status, none), others
+    )
 
 
-def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, Float[Array, "m b N"]]:
+def _newton(
+    problem: _FrictionProblem, modes: _Modes
+) -> tuple[_Modes, Float[Array, "m b N"]]:
     """Impulses x of modes, in space with the directions of slip that they lead to."""
     none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
     if modes.direction.shape[1] == 1:
@@ -407,11 +507,18 @@ def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, Float[Arr
     return fori_loop(0, _ITERATIONS, step, (modes, none))
 
 
-def _at_rest(problem: _FrictionProblem, x: Float[Array, "m b"], margin: Float[Array, ""]) -> _Modes:
-    """The modes (N = 1) that x has, where contacts stick that slip by less than `margin`."""
+def _at_rest(
+    problem: _FrictionProblem, x: Float[Array, "m b"], margin: Float[Array, ""]
+) -> _Modes:
+    """The modes (N = 1) that x has, where contacts stick that slip by less than
+    `margin`.
+    """
     rate = _rates(problem, x[..., None])  # (r, s)
     margin = (margin * _size(x[..., None]))[None]
-    taking = rate[:, 0] <= margin if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
+    if problem.complementary:
+        taking = rate[:, 0] <= margin
+    else:
+        taking = jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:
         begins = (problem.load > 0) & (problem.load < precision(x.dtype).eps)
         taking = taking & ~(begins[:, None] & (x[:, :1] <= margin))
@@ -427,11 +534,13 @@ def _at_rest(problem: _FrictionProblem, x: Float[Array, "m b"], margin: Float[Ar
 
 
 class _Inverted(NamedTuple):
-    """Inverse of the equations E of modes, with the weights D of the sharing and no derivatives.
+    """Inverse of the equations E of modes, with the weights D of the sharing and no
+    derivatives.
 
-    B = E D = U S V^T with n = m b rows: `inverse` is that of B + U_0 V_0^T, U_0 and V_0 the null
-    vectors. `held`: free impulses remain as they are, as the least ones are not allowed. Of more
-    than `_SHARED` rows the inverse is that of B with a ridge, and the pairs are 0.
+    B = E D = U S V^T with n = m b rows: `inverse` is that of B + U_0 V_0^T, U_0 and V_0
+    the null vectors. `held`: free impulses remain as they are, as the least ones are
+    not allowed. Of more than `_SHARED` rows the inverse is that of B with a ridge, and
+    the pairs are 0.
     """
 
     inverse: Float[Array, "n n"]
@@ -440,7 +549,9 @@ class _Inverted(NamedTuple):
     held: Bool[Array, ""]
 
 
-def _inverted(problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b"]) -> _Inverted:
+def _inverted(
+    problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b"]
+) -> _Inverted:
     """The equations of modes at x, inverted; see the class."""
     n = x.size
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
@@ -448,29 +559,39 @@ def _inverted(problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b"]) 
     scaled = (matrix[..., 0] * weight[None, None]).reshape(n, n)
     if n > _SHARED:
         eye = jnp.eye(n, dtype=x.dtype)
-        return _Inverted(jnp.linalg.inv(scaled + _RIDGE * eye), 0 * eye, weight, jnp.asarray(True))
+        return _Inverted(
+            jnp.linalg.inv(scaled + _RIDGE * eye), 0 * eye, weight, jnp.asarray(True)
+        )
     left, values, right, null = singular_values(scaled)
     inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
-    return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
+    return _Inverted(
+        inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True)
+    )
 
 
 def _weights(problem: _FrictionProblem, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
-    """Weights w of the `sum w x^2` that shared impulses make least: 1 of p, 1 / share of p_t."""
+    """Weights w of the `sum w x^2` that shared impulses make least: 1 of p, 1 / share
+    of p_t.
+    """
     share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
-    return jnp.concatenate([jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1)
+    return jnp.concatenate(
+        [jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1
+    )
 
 
 def _most_at_rest(
     problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b"]
 ) -> tuple[_Modes, _Inverted]:
-    """Modes with the velocities of x where all sticks that can, if its shared impulses are allowed.
+    """Modes with the velocities of x where all sticks that can, if its shared impulses
+    are allowed.
 
     Otherwise, and of more than `_SHARED` rows, the modes as they are.
     """
     if x.size > _SHARED:
         return modes, _inverted(problem, modes, x)
     rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
-    modes = modes._replace(taking=modes.taking & rest.taking)  # loads that begin open contacts
+    # loads that begin open contacts
+    modes = modes._replace(taking=modes.taking & rest.taking)
     both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
     inverted = jax.lax.map(lambda modes: _inverted(problem, modes, x), both)
     inverted = inverted._replace(held=jnp.array([False, True]))
@@ -484,7 +605,9 @@ def _most_at_rest(
 def _freedom(
     problem: _FrictionProblem, inverted: _Inverted
 ) -> tuple[Float[Array, "n n"], Int[Array, ""]]:
-    """Columns `D V_0 U_0^T` in which impulses are free, and a status that says what they change."""
+    """Columns `D V_0 U_0^T` in which impulses are free, and a status that says what
+    they change.
+    """
     free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
     if len(free) > _SHARED:  # there the inverse is large where impulses are free
         not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
@@ -497,14 +620,19 @@ def _freedom(
 
 
 def _on_modes(
-    problem: _FrictionProblem, modes: _Modes, inverted: _Inverted, x: Float[Array, "m b"]
+    problem: _FrictionProblem,
+    modes: _Modes,
+    inverted: _Inverted,
+    x: Float[Array, "m b"],
 ) -> Float[Array, "m b"]:
-    """Impulses x on their modes, with derivatives up to the third, by as many chord steps.
+    """Impulses x on their modes, with derivatives up to the third, by as many chord
+    steps.
 
-    With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, W the `_weights`, or holds
-    `V_0^T y`.
+    With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, W the `_weights`, or
+    holds `V_0^T y`.
     """
-    shape, n = x.shape, x.size
+    shape = x.shape
+    n = x.size
     weight = inverted.weight.reshape(n)
     start = x.reshape(n) / weight
 
@@ -529,9 +657,14 @@ def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
     r = 0 where p > r; a contact sticks where |s - p_t| is within its disc.
     """
     x = x[..., None]
-    rate, p = _rates(problem, x), x[:, 0]
-    taking = p > rate[:, 0] if problem.complementary else jnp.ones(p.shape, bool)
-    pull, bound = rate[:, 1:] - x[:, 1:], _bound(problem, x)
+    rate = _rates(problem, x)
+    p = x[:, 0]
+    if problem.complementary:
+        taking = p > rate[:, 0]
+    else:
+        taking = jnp.ones(p.shape, bool)
+    pull = rate[:, 1:] - x[:, 1:]
+    bound = _bound(problem, x)
     length = length_of(pull)
     sticks = (length <= bound) & _rubs(problem)
     slides = ~sticks & (bound > 0)
@@ -542,7 +675,8 @@ def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
 def _search(problem: _FrictionProblem) -> _Decision:
     """Modes of many contacts; other shares are not looked for.
 
-    By attempts of interior points, the last one by projections where contacts may part, each
+    By attempts of interior points, the last one by projections where contacts may part,
+    each
     with Newton's method on the modes that it leads to.
     """
 
@@ -551,7 +685,9 @@ def _search(problem: _FrictionProblem) -> _Decision:
         return _misfit(problem, x[..., None])[0]
 
     def polish(x: Float[Array, "m b"]) -> Float[Array, "m b"]:
-        """x after a step of Newton's method on its modes; what is free in them stays as it is."""
+        """x after a step of Newton's method on its modes; what is free in them stays as
+        it is.
+        """
         matrix, right = (y[..., 0] for y in _equations(problem, _modes_at(problem, x)))
         missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
         return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
@@ -559,7 +695,9 @@ def _search(problem: _FrictionProblem) -> _Decision:
     def newton(
         state: tuple[Float[Array, "m b"], Best, Int[Array, ""]],
     ) -> tuple[Float[Array, "m b"], Best, Int[Array, ""]]:
-        """x after a step of Newton's method, which may be worse; the best x; steps done."""
+        """x after a step of Newton's method, which may be worse; the best x; steps
+        done.
+        """
         x = polish(state[0])
         return x, better(misfit, state[1], x), state[2] + 1
 
@@ -568,7 +706,9 @@ def _search(problem: _FrictionProblem) -> _Decision:
         return ~(best.misfit <= problem.tolerance)
 
     def attempt(state: tuple[Best, Int[Array, ""]]) -> tuple[Best, Int[Array, ""]]:
-        """The best so far, or what attempt `number` leads to, and the number of the next one."""
+        """The best so far, or what attempt `number` leads to, and the number of the
+        next one.
+        """
         best, number = state
         tried = within_cones(cones, misfit, number, problem.tolerance)
         if problem.complementary:
@@ -583,10 +723,16 @@ def _search(problem: _FrictionProblem) -> _Decision:
         less = tried.misfit < best.misfit
         return jax.tree.map(lambda a, b: jnp.where(less, a, b), tried, best), number + 1
 
-    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(problem.matrix.shape)
-    cones, none = cones_of(*problem), jnp.zeros_like(problem.rate)
+    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(
+        problem.matrix.shape
+    )
+    cones = cones_of(*problem)
+    none = jnp.zeros_like(problem.rate)
     start = Best(none, jnp.inf + 0 * jnp.sum(problem.rate)), jnp.asarray(0)
-    most = ATTEMPTS + 1 if problem.complementary else ATTEMPTS
+    if problem.complementary:
+        most = ATTEMPTS + 1
+    else:
+        most = ATTEMPTS
     best, _ = while_loop(lambda s: wrong(s[0]) & (s[1] < most), attempt, start)
     status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
     return _Decision(_modes_at(problem, best.impulse), best.impulse, status, None)
@@ -595,7 +741,9 @@ def _search(problem: _FrictionProblem) -> _Decision:
 def _projected(
     problem: _FrictionProblem, x: Float[Array, "m b"], needed: Bool[Array, ""]
 ) -> Float[Array, "m b"]:
-    """Impulses after accelerated projections from x (`many_contacts.py`), if they are `needed`."""
+    """Impulses after accelerated projections from x (`many_contacts.py`), if they are
+    `needed`.
+    """
     return solve_many(
         lambda x: jnp.sum(problem.matrix * x[None, None], axis=(2, 3)),
         jnp.ones_like(problem.rate),
@@ -609,7 +757,8 @@ def _projected(
     ).impulse
 
 
-# ------------------------------------------------------------------- known normal forces
+# ------------------------------------------------------------------- known normal
+# forces
 
 
 def distribute(
@@ -618,11 +767,12 @@ def distribute(
     limit: Float[Array, "m B"],
     candidates: Bool[Array, "m B"],
 ) -> tuple[Bool[Array, "m B"], Float[Array, "t B"]]:
-    """Mask of the `candidates` that stick, and where the others slide to; normal forces are known.
+    """Mask of the `candidates` that stick, and where the others slide to; normal forces
+    are known.
 
     Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
-    `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A decision, without
-    derivatives: forces follow from the modes, to rounding.
+    `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A
+    decision, without derivatives: forces follow from the modes, to rounding.
 
     Args:
         matrix: K, positive semidefinite, t = m (planar) or 2 m, contact-major.
@@ -631,15 +781,19 @@ def distribute(
         candidates: other contacts have no force here.
 
     Returns:
-        A mask of the contacts that stick, and the directions of slip of the others. A contact in
-        space that others hold on the rim of its disc counts as sliding, at speed 0, against its
-        force. Contacts are relaxed in turn, 200 times at most: of strongly coupled ones near the
-        rim (of random pairs with nearly equal tangents 3 %) the last to settle may be wrong.
+        A mask of the contacts that stick, and the directions of slip of the others. A
+        contact in space that others hold on the rim of its disc counts as sliding, at
+        speed 0, against its force. Contacts are relaxed in turn, 200 times at most: of
+        strongly coupled ones near the rim (of random pairs with nearly equal tangents 3
+        %) the last to settle may be wrong.
 
     >>> import jax
     >>> import jax.numpy as jnp
     >>> from jimpact.numerics.friction import distribute
-    >>> k, candidates = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
+    >>> k, candidates = (
+    ...     jnp.ones((2, 2, 1)),
+    ...     jnp.ones((2, 1), bool),
+    ... )  # both corners of a block
     >>> problem = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), candidates)
     >>> stick, slip = jax.jit(distribute)(*problem)
     >>> stick[:, 0].tolist(), jnp.sign(slip[:, 0]).tolist()
@@ -669,28 +823,45 @@ def _lengths(force: Float[Array, "t *B"], rows: int) -> Float[Array, "m *B"]:
 def _relaxed(
     matrix: Float[Array, "t t B"], rate: Float[Array, "t B"], limit: Float[Array, "m B"]
 ) -> Float[Array, "t B"]:
-    """Forces lambda that satisfy the law of `distribute`, by projected Gauss-Seidel sweeps."""
-    m, (t, *batch) = len(limit), rate.shape
+    """Forces lambda that satisfy the law of `distribute`, by projected Gauss-Seidel
+    sweeps.
+    """
+    m = len(limit)
+    t, *batch = rate.shape
     rows = t // m
     least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
     of_contacts = matrix.reshape(m, rows, t, *batch)
     own = matrix[np.arange(t), np.arange(t)].reshape(m, rows, *batch)
-    stiffness = own[:, 0] if rows == 1 else own[:, 0] + own[:, 1]
+    if rows == 1:
+        stiffness = own[:, 0]
+    else:
+        stiffness = own[:, 0] + own[:, 1]
     stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
 
-    def relax(j: Int[Array, ""] | int, force: Float[Array, "t B"]) -> Float[Array, "t B"]:
-        """Forces after `lambda_j <- P(lambda_j - u_j' / stiffness_j)`, P projects on disc j."""
+    def relax(
+        j: Int[Array, ""] | int, force: Float[Array, "t B"]
+    ) -> Float[Array, "t B"]:
+        """Forces after `lambda_j <- P(lambda_j - u_j' / stiffness_j)`, P projects on
+        disc j.
+        """
         at_contact = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
-        change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
-        tried, most = at_contact - change / stiffness[j], limit[j][None]
+        change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(
+            of_contacts[j], force
+        )
+        tried = at_contact - change / stiffness[j]
+        most = limit[j][None]
         length = _lengths(tried, rows)
-        shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
+        shrink = jnp.where(
+            length > most, most / jnp.where(length > 0, length, 1.0), 1.0
+        )
         return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
 
     def sweep(
         state: tuple[Float[Array, "t B"], Bool[Array, ""], Int[Array, ""]],
     ) -> tuple[Float[Array, "t B"], Bool[Array, ""], Int[Array, ""]]:
-        """Forces after each contact was relaxed, whether any changed, and the sweeps so far."""
+        """Forces after each contact was relaxed, whether any changed, and the sweeps so
+        far.
+        """
         before, _, count = state
         force = fori_loop(0, m, relax, before)
         return force, jnp.any(jnp.abs(force - before) > least), count + 1

@@ -1,19 +1,22 @@
 """Contacts with friction, in the plane and in space: interior points.
 
-With p = g a, p_t = h y, h / g = mu the disc |p_t| <= mu (p + load) is the cone |y| <= a + load.
-With the rates scaled alike, nu = g r and s -> h s, contact with friction is
+With p = g a, p_t = h y, h / g = mu the disc |p_t| <= mu (p + load) is the cone |y| <= a
++ load. With the rates scaled alike, nu = g r and s -> h s, contact with friction is
 
     a nu = 0                      a, nu >= 0                           (complementary)
-    Y o K = (Y . K, Y_0 K_t + K_0 Y_t) = 0,   Y = (a + load, y) and K = (kappa, s) in the cone
+    Y o K = (Y . K, Y_0 K_t + K_0 Y_t) = 0,   Y = (a + load, y) and K = (kappa, s) in
+    the cone
 
-where kappa = |s|. For `nu = g r + |s| - kappa` with a known |s| this would be a convex problem,
-which Mehrotra's predictor and corrector solve in a few iterations, however redundant the contacts
-and wherever slip turns to. |s| is that of the iteration before as long as contacts might still
-stick, and changes with s where they slide. Where r = 0 is prescribed, a contact that pulls has
-p = g (a - nu), a nu = 0. Interior points converge slowly where p = r = 0, so Newton's method on the
-modes ends it.
+where kappa = |s|. For `nu = g r + |s| - kappa` with a known |s| this would be a convex
+problem, which Mehrotra's predictor and corrector solve in a few iterations, however
+redundant the contacts and wherever slip turns to. |s| is that of the iteration before
+as long as contacts might still stick, and changes with s where they slide. Where r = 0
+is prescribed, a contact that pulls has
+p = g (a - nu), a nu = 0. Interior points converge slowly where p = r = 0, so Newton's
+method on the modes ends it.
 
-Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the convex problem.
+Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the convex
+problem.
 """
 
 from collections.abc import Callable
@@ -29,27 +32,32 @@ from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import fori_loop, while_loop
 from jimpact.tools.precision import precision
 
-# Iterations of an attempt; 10 to 15 are usual. Ten times more: what diverges takes longer.
+# Iterations of an attempt; 10 to 15 are usual. Ten times more: what diverges takes
+# longer.
 _MOST = 25
-# Of the attempts: a contact counts as sliding whose |s|^2 is above this multiple of the mean of
-# a nu and Y . K. Ten times more: slower where contacts slide; ten times less: contacts that nearly
-# stick turn their slip in each iteration. 4 of 1 000 scenes of 4 to 12 contacts need the last one.
+# Of the attempts: a contact counts as sliding whose |s|^2 is above this multiple of the
+# mean of
+# a nu and Y . K. Ten times more: slower where contacts slide; ten times less: contacts
+# that nearly stick turn their slip in each iteration. 4 of 1 000 scenes of 4 to 12
+# contacts need the last one.
 _SLIDES = np.array([100.0, 1.0, 1e-4])
 ATTEMPTS = len(_SLIDES)
-# Misfit, as a part of the tolerance, at which Newton's method takes over after the first attempt
-# (which ends at the root of rounding). Ten times more: the modes are not yet right; ten times less:
-# contacts with p = r = 0 take all iterations.
+# Misfit, as a part of the tolerance, at which Newton's method takes over after the
+# first attempt (which ends at the root of rounding). Ten times more: the modes are not
+# yet right; ten times less: contacts with p = r = 0 take all iterations.
 _CLOSER = 1e-2
-# Of the way to the boundary of the cones, what an iteration goes at most. Closer to 1: those that
-# follow have no room.
+# Of the way to the boundary of the cones, what an iteration goes at most. Closer to 1:
+# those that follow have no room.
 _WITHIN = 0.99
-# Part of the mean of a nu and Y . K at least that an iteration aims at. Ten times more: slower; ten
-# times less: the last digits are those of rounding.
+# Part of the mean of a nu and Y . K at least that an iteration aims at. Ten times more:
+# slower; ten times less: the last digits are those of rounding.
 _LEAST_AIM = 1e-6
 
 
 class Cones(NamedTuple):
-    """Scaled problem: rates `constant + coupling x`, impulses `scale x`; b = 1 + rows columns."""
+    """Scaled problem: rates `constant + coupling x`, impulses `scale x`; b = 1 + rows
+    columns.
+    """
 
     coupling: Float[Array, "m b m b"]  # (m, b, m, b)
     constant: Float[Array, "m b"]  # (m, b)
@@ -85,12 +93,17 @@ def cones_of(
     load: Float[Array, " m"] | None,
     complementary: bool,
 ) -> Cones:
-    """The problem in impulses `(p, p_t) = (g a, h y)`, g = 1 / max(mu, 1) and h = mu g."""
+    """The problem in impulses `(p, p_t) = (g a, h y)`, g = 1 / max(mu, 1) and h = mu
+    g.
+    """
     large = jnp.maximum(friction, 1.0)
     sides = jnp.repeat((friction / large)[:, None], rate.shape[1] - 1, axis=1)
     scale = jnp.concatenate([1 / large[:, None], sides], axis=1)
     coupling = matrix * scale[:, :, None, None] * scale[None, None]
-    pressed = jnp.zeros_like(friction) if load is None else load * large
+    if load is None:
+        pressed = jnp.zeros_like(friction)
+    else:
+        pressed = load * large
     return Cones(coupling, rate * scale, scale, pressed, complementary)
 
 
@@ -110,10 +123,12 @@ def within_cones(
         tolerance: of the misfit.
 
     Returns:
-        The x of the least misfit: that of the first attempt is close, others are closer.
+        The x of the least misfit: that of the first attempt is close, others are
+            closer.
     """
     first_close = precision(cones.constant.dtype).root
-    unit, none = jnp.ones_like(cones.load), jnp.zeros_like(cones.constant[:, 1:])
+    unit = jnp.ones_like(cones.load)
+    none = jnp.zeros_like(cones.constant[:, 1:])
     nan = 0 * jnp.sum(cones.constant)  # NaN where a rate is not finite
     middle = _Inside(unit + nan, unit, none, unit, none)
     slides = jnp.asarray(_SLIDES, unit.dtype)[attempt]
@@ -129,10 +144,14 @@ def within_cones(
 
     first = Best(_impulse(cones, middle), jnp.asarray(jnp.inf, unit.dtype) + nan)
     start = middle, first, jnp.asarray(0)
-    return while_loop(lambda s: ~(s[1].misfit <= close) & (s[2] < most), iterate, start)[1]
+    return while_loop(
+        lambda s: ~(s[1].misfit <= close) & (s[2] < most), iterate, start
+    )[1]
 
 
-def better(misfit: Callable[[jax.Array], jax.Array], best: Best, x: Float[Array, "m b"]) -> Best:
+def better(
+    misfit: Callable[[jax.Array], jax.Array], best: Best, x: Float[Array, "m b"]
+) -> Best:
     """The impulses of less misfit: `best`, or x."""
     wrong = misfit(x)
     less = wrong < best.misfit
@@ -146,11 +165,15 @@ def _impulse(cones: Cones, at: _Inside) -> Float[Array, "m b"]:
 
 def _normal(cones: Cones, at: _Inside) -> Float[Array, " m"]:
     """Normal impulses a, or a - nu, which may pull, where rates are prescribed."""
-    return at.push if cones.complementary else at.push - at.normal
+    if cones.complementary:
+        return at.push
+    return at.push - at.normal
 
 
 def _mean(cones: Cones, at: _Inside) -> Float[Array, ""]:
-    """Mean of the products a nu and Y . K over all contacts, which is 0 at the solution."""
+    """Mean of the products a nu and Y . K over all contacts, which is 0 at the
+    solution.
+    """
     cone = (at.push + cones.load) * at.bound + jnp.sum(at.side * at.slip, axis=1)
     return jnp.mean(at.push * at.normal + cone) / 2
 
@@ -158,26 +181,35 @@ def _mean(cones: Cones, at: _Inside) -> Float[Array, ""]:
 def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
     """The next point: a predictor shows how small a nu and Y . K may become at once.
 
-    Changes are affine in those of (p, y) and in the aim: arrays (.., n + 2) of the n coefficients,
-    what is constant, and the factor of the aim.
+    Changes are affine in those of (p, y) and in the aim: arrays (.., n + 2) of the n
+    coefficients, what is constant, and the factor of the aim.
     """
     m, b = cones.constant.shape
-    n, mean = m * b, _mean(cones, at)
+    n = m * b
+    mean = _mean(cones, at)
     change, matrix, right = _linearized(cones, at, slides)
     moves = block_solve(matrix, right).reshape(n, 2)
 
     def ahead(aim: Float[Array, ""]) -> _Inside:
         """The next point, if all products shall be `aim`, as far as the cones allow."""
-        way = jnp.concatenate([moves[:, 0] + aim * moves[:, 1], jnp.stack([1.0 + 0 * aim, aim])])
+        way = jnp.concatenate(
+            [moves[:, 0] + aim * moves[:, 1], jnp.stack([1.0 + 0 * aim, aim])]
+        )
         way = jax.tree.map(lambda form: jnp.tensordot(form, way, axes=1), change)
         room = jnp.minimum(_room_in_cone(cones, at, way), _room_of_normals(at, way))
         part = jnp.minimum(1.0, _WITHIN * room)
         return jax.tree.map(lambda x, dx: x + part * dx, at, way)
 
-    def look(_: Any, state: tuple[_Inside, Float[Array, ""]]) -> tuple[_Inside, Float[Array, ""]]:
-        """The point ahead with this aim, and the aim that follows: `mean (mean+ / mean)^2`."""
+    def look(
+        _: Any, state: tuple[_Inside, Float[Array, ""]]
+    ) -> tuple[_Inside, Float[Array, ""]]:
+        """The point ahead with this aim, and the aim that follows:
+        `mean (mean+ / mean)^2`.
+        """
         point = ahead(state[1])
-        share = jnp.maximum(jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM)
+        share = jnp.maximum(
+            jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM
+        )
         return point, share * mean
 
     return fori_loop(0, 2, look, (at, jnp.zeros_like(mean)))[0]
@@ -186,23 +218,30 @@ def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
 def _linearized(
     cones: Cones, at: _Inside, slides: Float[Array, ""]
 ) -> tuple[_Inside, Float[Array, "m b m b"], Float[Array, "m b 2"]]:
-    """Changes of a point as affine forms, and the equations of their coefficients, linearized.
+    """Changes of a point as affine forms, and the equations of their coefficients,
+    linearized.
 
     Returns:
-        Forms with a last axis of n coefficients, a constant and the factor of the aim; the matrix,
-        and two right sides: of what is constant and of the aim.
+        Forms with a last axis of n coefficients, a constant and the factor of the aim;
+        the matrix, and two right sides: of what is constant and of the aim.
     """
     m, b = cones.constant.shape
     n = m * b
     eye = jnp.eye(n + 2, dtype=cones.constant.dtype)
-    x, constant, aim = eye[:n].reshape(m, b, n + 2), eye[n][None], eye[n + 1][None]
+    x = eye[:n].reshape(m, b, n + 2)
+    constant = eye[n][None]
+    aim = eye[n + 1][None]
     rates = jnp.pad(cones.coupling.reshape(m, b, n), ((0, 0), (0, 0), (0, 2)))
     own = jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1).reshape(n)
-    missed = cones.constant + jnp.tensordot(cones.coupling.reshape(m, b, n), own, axes=1)
+    missed = cones.constant + jnp.tensordot(
+        cones.coupling.reshape(m, b, n), own, axes=1
+    )
     speed = jnp.sqrt(jnp.sum(at.slip**2, axis=1))
     turns = (speed / (speed**2 + slides * _mean(cones, at)))[:, None] * at.slip
 
-    def dot(values: Float[Array, "m rows"], forms: Float[Array, "m rows w"]) -> Float[Array, "m w"]:
+    def dot(
+        values: Float[Array, "m rows"], forms: Float[Array, "m rows w"]
+    ) -> Float[Array, "m w"]:
         """Sums `sum_i v_ji f_ji` over the tangents i of each contact j."""
         return jnp.sum(values[..., None] * forms, axis=1)
 
@@ -224,10 +263,13 @@ def _linearized(
         normal = normal + off[:, None] * constant + dot(turns, slip) - bound
         first = at.push[:, None] * normal + at.normal[:, None] * push - product
     else:
-        first, normal = normal, push - x[:, 0]
+        first = normal
+        normal = push - x[:, 0]
     outer = radius[:, None] * at.slip + at.bound[:, None] * at.side
     sides = radius[:, None, None] * slip + at.bound[:, None, None] * side
-    sides = sides + at.side[..., None] * bound[:, None] + at.slip[..., None] * push[:, None]
+    sides = (
+        sides + at.side[..., None] * bound[:, None] + at.slip[..., None] * push[:, None]
+    )
     sides = sides + outer[..., None] * constant[None]
     equations = jnp.concatenate([first[:, None], sides], axis=1)
     matrix = equations[..., :n].reshape(m, b, m, b)
@@ -251,7 +293,8 @@ def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> Float[Array, ""]:
     grows = jnp.concatenate([way.push, way.bound])
     square = first**2 - jnp.sum(side**2, axis=1)
     root = jnp.sqrt(jnp.maximum(square, precision(first.dtype).tiny))
-    first, side = first / root, side / root[:, None]
+    first = first / root
+    side = side / root[:, None]
     along = first * grows - jnp.sum(side * change, axis=1)
     across = change - ((along + grows) / (1 + first))[:, None] * side
     out = jnp.max((jnp.sqrt(jnp.sum(across**2, axis=1)) - along) / root)

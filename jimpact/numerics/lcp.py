@@ -1,8 +1,10 @@
-"""Linear complementarity: `0 <= z  _|_  A z + q >= 0`, differentiable, batched, singular A too.
+"""Linear complementarity: `0 <= z  _|_  A z + q >= 0`, differentiable, batched,
+singular A too.
 
-Lemke's method finds which z are positive, with derivatives switched off; one linear solve on that
-support then gives values and derivatives of any order. At a kink (a contact about to take an
-impulse or to give one up) the derivatives are those of one side.
+Lemke's method finds which z are positive, with derivatives switched off; one linear
+solve on that support then gives values and derivatives of any order. At a kink (a
+contact about to take an impulse or to give one up) the derivatives are those of one
+side.
 """
 
 from typing import Any, NamedTuple
@@ -20,21 +22,25 @@ from jimpact.tools.loops import while_loop
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
-# The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Entries below this times
-# eps m are rounding, and no pivots. Ten times more: small pivots of very light bodies are missed;
-# ten times less: pivots at the level of rounding spoil one in a thousand degenerate problems.
+# The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Entries below
+# this times eps m are rounding, and no pivots. Ten times more: small pivots of very
+# light bodies are missed; ten times less: pivots at the level of rounding spoil one in
+# a thousand degenerate problems.
 _ROUNDING = 640.0
 _POWER = 2 / 3  # of eps: see `gathered_rounding`
 _PIVOTS = 10  # pivots allowed per unknown; 1 or 2 are usual
 
-# A sparse problem is solved by descent until it moves less than this many roundings, relative to
-# the largest q. Ten times more: velocities lose a digit.
+# A sparse problem is solved by descent until it moves less than this many roundings,
+# relative to the largest q. Ten times more: velocities lose a digit.
 _DESCENT_ROUNDINGS = 256
-_DESCENTS = 100_000  # steps of descent at most; packings of 3000 spheres take some thousand
+# steps of descent at most; packings of 3000 spheres take some thousand
+_DESCENTS = 100_000
 
 
 class LCP(NamedTuple):
-    """Solution z and `w = A z + q`; `code`: ok, impulse_not_unique, infeasible, max_steps."""
+    """Solution z and `w = A z + q`; `code`: ok, impulse_not_unique, infeasible,
+    max_steps.
+    """
 
     z: Float[Array, " m"]
     w: Float[Array, " m"]
@@ -44,7 +50,8 @@ class LCP(NamedTuple):
 class _Tableau(NamedTuple):
     """Tableau of Lemke's method for `w - A z - z_0 1 = q`, and the number of pivots."""
 
-    rows: Float[Array, "m w"]  # w = 2 m + 2 columns: w, z, the artificial variable, right-hand side
+    # w = 2 m + 2 columns: w, z, the artificial variable, right-hand side
+    rows: Float[Array, "m w"]
     basis: Int[Array, " m"]  # number of the variable that each row stands for
     entering: Int[Array, ""]  # number of the variable that enters the basis next
     ray: Bool[Array, ""]  # no row limits the entering variable: there is no solution
@@ -53,35 +60,46 @@ class _Tableau(NamedTuple):
 
 @full_precision
 def solve_lcp(
-    matrix: Symmetric, q: Float[Array, " m"], *, symmetric: bool = True, regular: bool | None = None
+    matrix: Symmetric,
+    q: Float[Array, " m"],
+    *,
+    symmetric: bool = True,
+    regular: bool | None = None,
 ) -> LCP:
     """Solve `0 <= z _|_ A z + q >= 0`.
 
     Args:
         matrix: A: symmetric positive semidefinite, stored in any way, or not symmetric
-            (`symmetric=False`) and such that Lemke's method applies (positive semidefinite,
-            copositive plus, P).
+            (`symmetric=False`) and such that Lemke's method applies (positive
+            semidefinite, copositive plus, P).
         q: the constant term.
-        symmetric: w is then unique; where z is not, the z of least norm (in the scaling that
-            makes the diagonal 1) is returned, with the code `impulse_not_unique`.
-        regular: A is known to be regular, which saves the search for its null space; None: as its
-            structure says.
+        symmetric: w is then unique; where z is not, the z of least norm (in the scaling
+            that makes the diagonal 1) is returned, with the code `impulse_not_unique`.
+        regular: A is known to be regular, which saves the search for its null space;
+            None: as its structure says.
 
-    Source: Lemke (1965); Cottle, Pang and Stone, The Linear Complementarity Problem (2009), 4.4.
+    Source: Lemke (1965); Cottle, Pang and Stone, The Linear Complementarity Problem
+    (2009), 4.4.
 
     >>> import jax.numpy as jnp
     >>> from jimpact.numerics.lcp import solve_lcp
-    >>> solution = solve_lcp(jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0]))
+    >>> solution = solve_lcp(
+    ...     jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0])
+    ... )
     >>> [round(float(z), 6) for z in solution.z]
     [0.5, 0.0]
     """
     if isinstance(matrix, Sparse):
         return _solve_sparse(matrix, q)
-    regular = is_regular(matrix) if regular is None else regular
+    if regular is None:
+        regular = is_regular(matrix)
     matrix = as_matrix(matrix)
     diagonal = jax.lax.stop_gradient(jnp.diagonal(matrix))
-    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
-    a, b = matrix * scale[:, None] * scale[None, :], q * scale
+    scale = jnp.where(
+        diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0
+    )
+    a = matrix * scale[:, None] * scale[None, :]
+    b = q * scale
     largest = jax.lax.stop_gradient(jnp.abs(b).max())
     size = jnp.where(largest > 0, largest, 1.0)
     b = b / size
@@ -99,11 +117,12 @@ def solve_lcp(
 
 
 def _solve_sparse(matrix: Sparse, q: Float[Array, " m"]) -> LCP:
-    """Solve `0 <= z _|_ A z + q >= 0` by products `A z` only, A symmetric positive semidefinite.
+    """Solve `0 <= z _|_ A z + q >= 0` by products `A z` only, A symmetric positive
+    semidefinite.
 
-    Which of several z is returned is left to the descent. Values are those of the descent, and
-    derivatives those of the linear system on its support: where A is singular there, they are
-    right for `A z`, and NaN where not even that has any.
+    Which of several z is returned is left to the descent. Values are those of the
+    descent, and derivatives those of the linear system on its support: where A is
+    singular there, they are right for `A z`, and NaN where not even that has any.
     """
     constant, rate = jax.lax.stop_gradient((matrix, q))
     tolerance = _DESCENT_ROUNDINGS * precision(q.dtype).eps
@@ -121,10 +140,15 @@ def _solve_sparse(matrix: Sparse, q: Float[Array, " m"]) -> LCP:
     support = z > 0
     scale = 1 / jnp.sqrt(constant.diagonal)
     a = matrix.scaled(scale).within(support)
-    solved = scale * conjugate_gradients(lambda x: a @ x, jnp.where(support, -q * scale, 0.0))
+    solved = scale * conjugate_gradients(
+        lambda x: a @ x, jnp.where(support, -q * scale, 0.0)
+    )
     z = z + (solved - jax.lax.stop_gradient(solved))
-    # A is singular if a right side is not in its range: nearly all have a part in its null space
-    other = jnp.where(support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0)
+    # A is singular if a right side is not in its range: nearly all have a part in its
+    # null space
+    other = jnp.where(
+        support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0
+    )
     fixed = jax.lax.stop_gradient(a)
     singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: fixed @ x, other)))
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
@@ -135,8 +159,8 @@ def _solve_sparse(matrix: Sparse, q: Float[Array, " m"]) -> LCP:
 def gathered_rounding(unknowns: int, dtype: Any) -> float:
     """Rounding `m eps^(2/3)` of m unknowns that a whole run may gather.
 
-    A larger artificial variable left at its end means that there is no solution; a larger w means
-    that the contact is open.
+    A larger artificial variable left at its end means that there is no solution; a
+    larger w means that the contact is open.
     """
     return unknowns * precision(dtype).eps ** _POWER
 
@@ -159,10 +183,11 @@ def _solve_on(
 def _least_norm(
     a: Float[Array, "m m"], b: Float[Array, " m"], z: Float[Array, " m"]
 ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-    """Solution of least norm among those with the w of `z`, and whether there are several.
+    """Solution of least norm among those with the w of `z`, and whether there are
+    several.
 
-    With P the projector on the null space of A where w = 0, they are `r + P y >= 0`, r = z - P z;
-    the least has `y >= 0`, complementary to r + P y: one more such problem.
+    With P the projector on the null space of A where w = 0, they are `r + P y >= 0`, r
+    = z - P z; the least has `y >= 0`, complementary to r + P y: one more such problem.
     """
     m = b.shape[0]
     w = jax.lax.stop_gradient(a @ z + b)
@@ -178,15 +203,23 @@ def _least_norm(
 
 
 def _rounding(unknowns: int, dtype: Any) -> float:
-    """Rounding `640 eps m` of entries in a tableau of Lemke's method with m unknowns."""
+    """Rounding `640 eps m` of entries in a tableau of Lemke's method with m
+    unknowns.
+    """
     return _ROUNDING * precision(dtype).eps * unknowns
 
 
 def _wrong(
-    a: Float[Array, "m m"], b: Float[Array, " m"], support: Bool[Array, " m"], z: Float[Array, " m"]
+    a: Float[Array, "m m"],
+    b: Float[Array, " m"],
+    support: Bool[Array, " m"],
+    z: Float[Array, " m"],
 ) -> Bool[Array, ""]:
-    """True if z or w has a wrong sign, or z is so large that the rounding of A z hides b."""
-    size, gathered = jnp.max(jnp.abs(z)), gathered_rounding(len(b), b.dtype)
+    """True if z or w has a wrong sign, or z is so large that the rounding of A z hides
+    b.
+    """
+    size = jnp.max(jnp.abs(z))
+    gathered = gathered_rounding(len(b), b.dtype)
     noise = _rounding(len(b), b.dtype) * size  # of A z, where the largest q is 1
     w = jnp.where(support, 0.0, a @ z + b)
     signs = (z >= -gathered * jnp.maximum(1.0, size)) & (w >= -gathered - noise)
@@ -196,8 +229,11 @@ def _wrong(
 def _support(
     a: Float[Array, "m m"], b: Float[Array, " m"]
 ) -> tuple[Bool[Array, " m"], Int[Array, ""]]:
-    """Mask of the positive z in `0 <= z _|_ A z + b >= 0`, and the code: Lemke's method."""
-    m, dtype = b.shape[0], b.dtype
+    """Mask of the positive z in `0 <= z _|_ A z + b >= 0`, and the code: Lemke's
+    method.
+    """
+    m = b.shape[0]
+    dtype = b.dtype
     tolerance = _rounding(m, dtype)
     ones = jnp.ones((m, 1), dtype)
     rows = jnp.concatenate([jnp.eye(m, dtype=dtype), -a, -ones, b[:, None]], axis=1)
@@ -211,12 +247,16 @@ def _support(
     limit = _PIVOTS * (m + 1)
 
     def going(state: _Tableau) -> Bool[Array, ""]:
-        """True while the artificial variable is basic, no ray was found and pivots are left."""
+        """True while the artificial variable is basic, no ray was found and pivots are
+        left.
+        """
         inside = jnp.any(state.basis == artificial)
         return needed & inside & ~state.ray & (state.pivots < limit)
 
     def one(state: _Tableau) -> _Tableau:
-        """Tableau after one pivot, or as it is if a ray shows that there is no solution."""
+        """Tableau after one pivot, or as it is if a ray shows that there is no
+        solution.
+        """
         row, ray = _leaving(state, tolerance)
         moved = _pivot(state, row)
         chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
@@ -231,22 +271,32 @@ def _support(
     return support, jnp.where(stuck, reason, CODE["ok"])
 
 
-def _leaving(state: _Tableau, tolerance: float) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """Row of the least ratio of right side to entering column, and whether there is none (a ray).
+def _leaving(
+    state: _Tableau, tolerance: float
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Row of the least ratio of right side to entering column, and whether there is
+    none (a ray).
 
-    No order among ties (lexicographic, say) changed any of over 80 000 degenerate problems; a cycle
-    would end as `max_steps`.
+    No order among ties (lexicographic, say) changed any of over 80 000 degenerate
+    problems; a cycle would end as `max_steps`.
     """
     m = state.basis.shape[0]
-    column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(state.rows.dtype)
+    column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(
+        state.rows.dtype
+    )
     candidates = column > tolerance
-    ratio = jnp.where(candidates, state.rows[:, -1] / jnp.where(candidates, column, 1.0), jnp.inf)
+    ratio = jnp.where(
+        candidates, state.rows[:, -1] / jnp.where(candidates, column, 1.0), jnp.inf
+    )
     return jnp.argmin(ratio), ~jnp.any(candidates)
 
 
 def _pivot(state: _Tableau, row: Int[Array, ""]) -> _Tableau:
-    """Tableau in which the entering variable replaces that of `row`; its complement enters next."""
-    m, dtype = state.basis.shape[0], state.rows.dtype
+    """Tableau in which the entering variable replaces that of `row`; its complement
+    enters next.
+    """
+    m = state.basis.shape[0]
+    dtype = state.rows.dtype
     column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(dtype)
     chosen = jnp.arange(m) == row
     pivot_row = chosen.astype(dtype) @ state.rows

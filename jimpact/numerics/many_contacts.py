@@ -1,13 +1,14 @@
-"""Unilateral contacts with friction by accelerated projections: only products `A x` are needed.
+"""Unilateral contacts with friction by accelerated projections: only products `A x` are
+needed.
 
 The problem is that of `friction.solve`, complementary,
 
     0 <= r _|_ p >= 0,    p_t in -mu p Sgn(s),    (r, s) = (a, b) + A x,   x = (p, p_t),
 
-for thousands of contacts, to a tolerance, without derivatives and without the search for further
-solutions. One iteration is a step against (r, s) and a projection onto p >= 0 and onto the discs
-|p_t| <= mu p; Nesterov's momentum, given up where it points uphill, makes some hundred of them
-enough for a pile.
+for thousands of contacts, to a tolerance, without derivatives and without the search
+for further solutions. One iteration is a step against (r, s) and a projection onto p >=
+0 and onto the discs |p_t| <= mu p; Nesterov's momentum, given up where it points
+uphill, makes some hundred of them enough for a pile.
 """
 
 from collections.abc import Callable
@@ -22,12 +23,13 @@ from jimpact.numerics.discs import in_disc
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
 
-# Factors of the inverse step size, the estimate of the largest eigenvalue: where a step shows that
-# it is too small, and at the beginning of the next problem. Further from 1: short steps, or steps
-# taken back.
-STEEPER, RELAX = 1.5, 0.9
-# Discs grow and shrink with p: full momentum may go round and round among them. So there is less
-# of it in each quarter of the iterations.
+# Factors of the inverse step size, the estimate of the largest eigenvalue: where a step
+# shows that it is too small, and at the beginning of the next problem. Further from 1:
+# short steps, or steps taken back.
+STEEPER = 1.5
+RELAX = 0.9
+# Discs grow and shrink with p: full momentum may go round and round among them. So
+# there is less of it in each quarter of the iterations.
 MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
 
 
@@ -75,19 +77,27 @@ def solve_many(
         rate: (a, b) [m/s].
         friction: mu.
         start: x to begin with.
-        inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal of 1.
+        inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal
+            of 1.
         tolerance: misfit at which it ends, of the largest of `rate`.
         most: iterations, an int or ().
         load: normal impulses in addition to p, which friction includes; None: 0.
 
-    Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn, Negrut and
-    Tasora, ACM Trans. Graph. 34 (2015) for granular media (there the cone is convexified, which
-    opens contacts that slide; here it is not).
+    Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn,
+    Negrut and Tasora, ACM Trans. Graph. 34 (2015) for granular media (there the cone is
+    convexified, which opens contacts that slide; here it is not).
 
     >>> import jax.numpy as jnp
     >>> from jimpact.numerics.many_contacts import solve_many
     >>> one = jnp.ones((1, 2))
-    >>> problem = (jnp.array([[-1.0, 3.0]]), jnp.array(0.5), 0 * one, jnp.array(1.0), 1e-6, 100)
+    >>> problem = (
+    ...     jnp.array([[-1.0, 3.0]]),
+    ...     jnp.array(0.5),
+    ...     0 * one,
+    ...     jnp.array(1.0),
+    ...     1e-6,
+    ...     100,
+    ... )
     >>> [round(float(x), 5) for x in solve_many(lambda x: x, one, *problem).impulse[0]]
     [1.0, -0.5]
     """
@@ -95,7 +105,10 @@ def solve_many(
     # discs stay discs: all tangents of a contact have one scale
     slope = friction * scale[:, 0] / scale[:, -1]
     goal = rate * scale
-    carried = None if load is None else load / scale[:, 0]
+    if load is None:
+        carried = None
+    else:
+        carried = load / scale[:, 0]
     size = jnp.max(jnp.abs(goal))
 
     def times(x: Float[Array, "m b"]) -> Float[Array, "m b"]:
@@ -107,11 +120,14 @@ def solve_many(
         return (at.misfit > tolerance * size) & (at.tries < most)
 
     def iterate(at: _At) -> _At:
-        """State after the step `x = P(y - (A y + rate) / L)`, P the projection on the cones."""
+        """State after the step `x = P(y - (A y + rate) / L)`, P the projection on the
+        cones.
+        """
         x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope, carried)
         return _with_momentum(at, x, times(x), most)
 
-    x = _projected(start / scale, slope, carried) + 0 * size  # NaN where a rate is not finite
+    # NaN where a rate is not finite
+    x = _projected(start / scale, slope, carried) + 0 * size
     ax = times(x)
     unit = jnp.ones((), x.dtype)
     inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
@@ -123,7 +139,9 @@ def solve_many(
 
 
 def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
-    """Scales of the impulses, 1 / sqrt of the diagonal; the tangents of a contact share one."""
+    """Scales of the impulses, 1 / sqrt of the diagonal; the tangents of a contact share
+    one.
+    """
     squares = jnp.concatenate(
         [diagonal[:, :1], jnp.mean(diagonal[:, 1:], axis=1, keepdims=True)], axis=1
     )
@@ -134,30 +152,41 @@ def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
 def _projected(
     x: Float[Array, "m b"], slope: Float[Array, " m"], load: Float[Array, " m"] | None
 ) -> Float[Array, "m b"]:
-    """Nearest impulses with `p >= 0`, then with `|p_t| <= slope (p + load)`, slope: scaled mu."""
+    """Nearest impulses with `p >= 0`, then with `|p_t| <= slope (p + load)`, slope:
+    scaled mu.
+    """
     p = jnp.maximum(x[:, :1], 0.0)
     radius = slope[:, None] * (p if load is None else p + load[:, None])
     return jnp.concatenate([p, in_disc(x[:, 1:, None], radius)[..., 0]], axis=1)
 
 
-def _with_momentum(at: _At, x: Float[Array, "m b"], ax: Float[Array, "m b"], most: Any) -> _At:
-    """The iterate after a projected step from y to x, with A x: Nesterov's method with restarts.
+def _with_momentum(
+    at: _At, x: Float[Array, "m b"], ax: Float[Array, "m b"], most: Any
+) -> _At:
+    """The iterate after a projected step from y to x, with A x: Nesterov's method with
+    restarts.
 
-    Equation: y+ is `x + (t - 1) / t+ (x - x before)`, `t+ = (1 + sqrt(1 + 4 t^2)) / 2`. Where
-    `step . A step > L |step|^2`, L the inverse step size, the step overshoots: x is not taken, and
-    L grows. There, and where the momentum points uphill, t begins again with 1. The best x is that
-    of the least misfit, `L max|step|`.
+    Equation: y+ is `x + (t - 1) / t+ (x - x before)`, `t+ = (1 + sqrt(1 + 4 t^2)) / 2`.
+    Where `step . A step > L |step|^2`, L the inverse step size, the step overshoots: x
+    is not taken, and L grows. There, and where the momentum points uphill, t begins
+    again with 1. The best x is that of the least misfit, `L max|step|`.
     """
-    step, a_step = x - at.y, ax - at.ay
+    step = x - at.y
+    a_step = ax - at.ay
     square = jnp.vdot(step, step)
     overshoots = jnp.vdot(step, a_step) > at.inverse_step_size * square * (1 + 1e-9)
     restarts = overshoots | (jnp.vdot(step, x - at.x) < 0)
     weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
     # less momentum where many iterations did not suffice
-    allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // jnp.maximum(most, 1)]
+    allowed = jnp.asarray(MOMENTUM, x.dtype)[
+        len(MOMENTUM) * at.tries // jnp.maximum(most, 1)
+    ]
     momentum = jnp.where(restarts, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
-    x, ax = jnp.where(overshoots, at.x, x), jnp.where(overshoots, at.ax, ax)
-    misfit = jnp.where(overshoots, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step)))
+    x = jnp.where(overshoots, at.x, x)
+    ax = jnp.where(overshoots, at.ax, ax)
+    misfit = jnp.where(
+        overshoots, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step))
+    )
     better = ~(misfit >= at.misfit)  # also NaN, which is then the result
     return _At(
         x=x,

@@ -1,4 +1,6 @@
-"""A symmetric matrix with few entries in each row, such as the Delassus matrix of a packing."""
+"""A symmetric matrix with few entries in each row, such as the Delassus matrix of a
+packing.
+"""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -14,20 +16,22 @@ from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
 from jimpact.tools.precision import precision
 
-# Residual over the right side at which conjugate gradients end, in roundings, and the one from
-# which on the system counts as having no solution, as a power of eps. Ten times more: derivatives
-# lose a digit; systems without a solution pass.
-_CONVERGED, _NO_SOLUTION = 1e3, 0.25
-# Iterations per unknown that conjugate gradients take at most; a packing of 3000 spheres takes .1.
-# Ten times more: a singular system takes ten times longer to be found.
+# Residual over the right side at which conjugate gradients end, in roundings, and the
+# one from which on the system counts as having no solution, as a power of eps. Ten
+# times more: derivatives lose a digit; systems without a solution pass.
+_CONVERGED = 1e3
+_NO_SOLUTION = 0.25
+# Iterations per unknown that conjugate gradients take at most; a packing of 3000
+# spheres takes .1. Ten times more: a singular system takes ten times longer to be
+# found.
 _MOST = 2
 
 
 class Neighbours:
     """Contacts (m, 2) between two bodies each, and which contacts have a common body.
 
-    Body -1 is none (a wall). It is part of the structure of a program, not of its data, so it is
-    compared by its numbers.
+    Body -1 is none (a wall). It is part of the structure of a program, not of its data,
+    so it is compared by its numbers.
     """
 
     def __init__(self, bodies: Any, count: int):
@@ -43,13 +47,18 @@ class Neighbours:
 
     @cached_property
     def of_contacts(self) -> np.ndarray:
-        """Table (m, K) of the neighbours of each contact, itself where it has fewer than K."""
+        """Table (m, K) of the neighbours of each contact, itself where it has fewer
+        than K.
+        """
         of_body: list[list[int]] = [[] for _ in range(self.count)]
         for contact, pair in enumerate(self.bodies):
             for body in pair[pair >= 0]:
                 of_body[body].append(contact)
         rows = [
-            sorted({other for body in pair[pair >= 0] for other in of_body[body]} - {contact})
+            sorted(
+                {other for body in pair[pair >= 0] for other in of_body[body]}
+                - {contact}
+            )
             for contact, pair in enumerate(self.bodies)
         ]
         table = np.tile(np.arange(len(rows))[:, None], (1, max(1, *map(len, rows))))
@@ -60,13 +69,16 @@ class Neighbours:
     @cached_property
     def shared(self) -> np.ndarray:
         """Mask (m, K, 2, 2): body s of a contact is body t of its k-th neighbour."""
-        own, other = self.bodies[:, None, :, None], self.bodies[self.of_contacts][:, :, None, :]
+        own = self.bodies[:, None, :, None]
+        other = self.bodies[self.of_contacts][:, :, None, :]
         real = self.of_contacts != np.arange(len(self.bodies))[:, None]
         return (own == other) & (own >= 0) & real[:, :, None, None]
 
 
 class Sparse(eqx.Module):
-    """Symmetric matrix: its diagonal, and the entries at the K neighbours of each row."""
+    """Symmetric matrix: its diagonal, and the entries at the K neighbours of each
+    row.
+    """
 
     diagonal: Float[Array, " m"]
     entries: Float[Array, "m K"]
@@ -75,7 +87,9 @@ class Sparse(eqx.Module):
     def __matmul__(self, vector: Float[ArrayLike, " m"]) -> Float[Array, " m"]:
         """Product `A x`."""
         vector = jnp.asarray(vector)
-        return self.diagonal * vector + neighbour_sum(self.entries, vector, self.neighbours)
+        return self.diagonal * vector + neighbour_sum(
+            self.entries, vector, self.neighbours
+        )
 
     def __abs__(self) -> "Sparse":
         """|A|, entry by entry."""
@@ -93,13 +107,19 @@ class Sparse(eqx.Module):
         return Sparse(self.diagonal * scale**2, entries, self.neighbours)
 
     def within(self, part: Bool[Array, " m"]) -> "Sparse":
-        """The matrix whose rows and columns outside the mask `part` hold their diagonal only."""
+        """The matrix whose rows and columns outside the mask `part` hold their diagonal
+        only.
+        """
         both = part[:, None] & part[self.neighbours.of_contacts]
-        return Sparse(self.diagonal, jnp.where(both, self.entries, 0.0), self.neighbours)
+        return Sparse(
+            self.diagonal, jnp.where(both, self.entries, 0.0), self.neighbours
+        )
 
 
 def neighbour_sum(
-    entries: Float[Array, "m K *#B"], vector: Float[Array, "m *#B"], neighbours: Neighbours
+    entries: Float[Array, "m K *#B"],
+    vector: Float[Array, "m *#B"],
+    neighbours: Neighbours,
 ) -> Float[Array, "m *#B"]:
     """`sum_k a_jk x_n(j, k)` with n(j, k) the k-th neighbour of contact j."""
     return jnp.sum(entries * vector[neighbours.of_contacts], axis=1)
@@ -111,8 +131,8 @@ def conjugate_gradients(
 ) -> Float[Array, " m"]:
     """`A^-1 right` by products with A symmetric, positive semidefinite, of diagonal 1.
 
-    The solution of least norm where A is singular, NaN where there is none. Differentiable.
-    Source: Hestenes and Stiefel (1952).
+    The solution of least norm where A is singular, NaN where there is none.
+    Differentiable. Source: Hestenes and Stiefel (1952).
 
     >>> import jax.numpy as jnp
     >>> from jimpact.numerics.sparse import conjugate_gradients
@@ -126,16 +146,22 @@ def conjugate_gradients(
 def _iterated(
     product: Callable[[jax.Array], jax.Array], right: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """`A^-1 right` as `conjugate_gradients`, from x = 0; NaN where the residual does not vanish."""
+    """`A^-1 right` as `conjugate_gradients`, from x = 0; NaN where the residual does
+    not vanish.
+    """
     eps = precision(right.dtype).eps
     size = jnp.vdot(right, right)
 
     def going(state: tuple[Iterate, Int[Array, ""]]) -> Bool[Array, ""]:
         """True while the residual is too large and iterations are left."""
         at, done = state
-        return (at.square > (_CONVERGED * eps) ** 2 * size) & (done < _MOST * len(right) + 10)
+        return (at.square > (_CONVERGED * eps) ** 2 * size) & (
+            done < _MOST * len(right) + 10
+        )
 
-    def iterate(state: tuple[Iterate, Int[Array, ""]]) -> tuple[Iterate, Int[Array, ""]]:
+    def iterate(
+        state: tuple[Iterate, Int[Array, ""]],
+    ) -> tuple[Iterate, Int[Array, ""]]:
         """State after one more step, and the number of steps."""
         at, done = state
         new, curved = conjugate_step(product, jnp.vdot, at)
@@ -148,7 +174,9 @@ def _iterated(
 
 
 class Iterate(NamedTuple):
-    """State of conjugate gradients for one system A x = right, or for a batch in the last axis."""
+    """State of conjugate gradients for one system A x = right, or for a batch in the
+    last axis.
+    """
 
     x: Float[Array, "m *B"]
     residual: Float[Array, "m *B"]  # r = right - A x
@@ -161,9 +189,11 @@ def conjugate_step(
     dot: Callable[[jax.Array, jax.Array], jax.Array],
     at: Iterate,
 ) -> tuple[Iterate, Bool[Array, "..."]]:
-    """State after a step of conjugate gradients, and whether A has curvature along its direction.
+    """State after a step of conjugate gradients, and whether A has curvature along its
+    direction.
 
-    Equation: `x + a d`, `r - a A d`, `r+ + b d` with `a = r^T r / d^T A d`, `b = r+^T r+ / r^T r`.
+    Equation: `x + a d`, `r - a A d`, `r+ + b d` with `a = r^T r / d^T A d`,
+    `b = r+^T r+ / r^T r`.
 
     Args:
         product: A times a vector.
@@ -175,14 +205,16 @@ def conjugate_step(
     curvature = dot(direction, image)
     curved = curvature > 0
     length = jnp.where(curved, square / jnp.where(curved, curvature, 1.0), 0.0)
-    x, residual = x + length * direction, residual - length * image
+    x = x + length * direction
+    residual = residual - length * image
     new = dot(residual, residual)
     ratio = jnp.where(square > 0, new / jnp.where(square > 0, square, 1.0), 0.0)
     return Iterate(x, residual, residual + ratio * direction, new), curved
 
 
 def components(touches: np.ndarray) -> np.ndarray:
-    """Labels of the columns of a boolean matrix: the first column of their connected component.
+    """Labels of the columns of a boolean matrix: the first column of their connected
+    component.
 
     Columns with a common row are connected.
     """

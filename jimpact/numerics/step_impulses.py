@@ -1,17 +1,20 @@
-"""The impulses of one implicit step: friction in discs, and normal impulses that unloading cuts.
+"""The impulses of one implicit step: friction in discs, and normal impulses that
+unloading cuts.
 
-A step looks for impulses q = (f, y), normal (m) and tangential (t), at which the velocities
+A step looks for impulses q = (f, y), normal (m) and tangential (t), at which the
+velocities
 `w = b + K q` after it satisfy
 
-    friction    y_j in the disc of radius mu_j f_j, against u_j: at its rim where u_j is not 0
-    normal      f_j = F_j - a_j max(gamma_j, 0), not below 0
+    friction    y_j in the disc of radius mu_j f_j, against u_j: at its rim where u_j is
+    not 0 normal      f_j = F_j - a_j max(gamma_j, 0), not below 0
 
-with the force F_j that the indentation at the beginning of the step gives, and the part a_j gamma_j
-of it that a fast unloading takes away within the step (0: none). With F_j and the radii known this
-is a convex problem; projected gradients, extrapolated by Anderson's method, solve it from the
-impulses of the step before, scaled to the new load. Which contacts stick, which slip and where to,
-and who carries what where contacts are redundant, comes out of the minimum: no modes, nothing to be
-compiled for each contact.
+with the force F_j that the indentation at the beginning of the step gives, and the part
+a_j gamma_j of it that a fast unloading takes away within the step (0: none). With F_j
+and the radii known this is a convex problem; projected gradients, extrapolated by
+Anderson's method, solve it from the impulses of the step before, scaled to the new
+load. Which contacts stick, which slip and where to, and who carries what where contacts
+are redundant, comes out of the minimum: no modes, nothing to be compiled for each
+contact.
 """
 
 from typing import Any, NamedTuple
@@ -26,13 +29,13 @@ from jimpact.numerics.discs import in_disc
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision
 
-# Sweeps of one solve at most; 1 to 4 are usual. What is left then is an error of the step, which
-# becomes shorter. Batches wait for their slowest solve: twice as many already take half as long
-# again for boxes that are nearly flat, in as many steps.
+# Sweeps of one solve at most; 1 to 4 are usual. What is left then is an error of the
+# step, which becomes shorter. Batches wait for their slowest solve: twice as many
+# already take half as long again for boxes that are nearly flat, in as many steps.
 SWEEPS = 8
-# Added to the diagonal of the tangent equations, which are singular where contacts stick
-# redundantly. Velocities do not depend on it. Ten times more: derivatives err by ten times the
-# rounding that it amplifies.
+# Added to the diagonal of the tangent equations, which are singular where contacts
+# stick redundantly. Velocities do not depend on it. Ten times more: derivatives err by
+# ten times the rounding that it amplifies.
 RIDGE = 1e-10
 
 
@@ -44,14 +47,18 @@ class StepProblem(NamedTuple):
     load: Float[Array, "m B"]  # F, the largest normal impulses
     unloading: Float[Array, "m B"]  # a >= 0
     friction: Float[Array, "m B"]  # mu
-    descent: Float[Array, "n B"]  # lengths of the steps of descent, see `descent_lengths`
+    # lengths of the steps of descent, see `descent_lengths`
+    descent: Float[Array, "n B"]
 
     def projected(self, tried: Float[Array, "n B"]) -> Float[Array, "n B"]:
-        """The admissible impulses next to those `tried` by a step of descent of length d.
+        """The admissible impulses next to those `tried` by a step of descent of length
+        d.
 
-        Normal: `(a f + d F) / (a + d)` in [0, F], or F where a = 0; tangential: in the disc mu f.
+        Normal: `(a f + d F) / (a + d)` in [0, F], or F where a = 0; tangential: in the
+        disc mu f.
         """
-        m, step = len(self.load), self.descent[: len(self.load)]
+        m = len(self.load)
+        step = self.descent[: len(self.load)]
         cut = (self.unloading * tried[:m] + step * self.load) / (self.unloading + step)
         normal = jnp.where(self.unloading > 0, jnp.clip(cut, 0.0, self.load), self.load)
         side = tried[m:].reshape(m, -1, tried.shape[-1])
@@ -65,11 +72,15 @@ class StepProblem(NamedTuple):
     def derivative(self, impulses: Float[Array, "n B"]) -> Float[Array, "n n B"]:
         """Jacobian in q of the residual `q - projected(q - d w(q))`.
 
-        A contact's projection depends on its own rows only: one direction for each kind of row.
+        A contact's projection depends on its own rows only: one direction for each kind
+        of row.
         """
-        n, m = len(impulses), len(self.load)
+        n = len(impulses)
+        m = len(self.load)
         kinds = n // m
-        rows = np.concatenate([np.arange(m)[:, None], m + np.arange(n - m).reshape(m, -1)], axis=1)
+        rows = np.concatenate(
+            [np.arange(m)[:, None], m + np.arange(n - m).reshape(m, -1)], axis=1
+        )
         owner = np.argsort(rows.ravel()) // kinds  # the contact of each row
         tried = impulses - self.descent * self.velocities(impulses)
         one = jnp.eye(n, dtype=tried.dtype)[..., None]
@@ -87,11 +98,13 @@ def descent_lengths(
 ) -> Float[Array, "n B"]:
     """Lengths d with which descent converges: diag(1/d) - K is positive semidefinite.
 
-    Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the largest
-    eigenvalue is then at most the largest sum of a row, and the fourth root of the Frobenius norm
-    of the fourth power. `friction_only`: normal impulses are known, so their rows do not count.
+    Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the
+    largest eigenvalue is then at most the largest sum of a row, and the fourth root of
+    the Frobenius norm of the fourth power. `friction_only`: normal impulses are known,
+    so their rows do not count.
 
-    Equation: `1 / d_i = size_i min(max_j sum_k |S_jk|, |S^4|^(1/4))` with the scaled matrix S.
+    Equation: `1 / d_i = size_i min(max_j sum_k |S_jk|, |S^4|^(1/4))` with the scaled
+    matrix S.
     """
     n = len(coupling)
     size = coupling[jnp.arange(n), jnp.arange(n)]
@@ -114,7 +127,9 @@ def descent_lengths(
 
 
 class Move(NamedTuple):
-    """Impulses that a step of descent reaches, and its way to them: reached minus start."""
+    """Impulses that a step of descent reaches, and its way to them: reached minus
+    start.
+    """
 
     reached: Float[Array, "n B"]
     way: Float[Array, "n B"]
@@ -123,25 +138,33 @@ class Move(NamedTuple):
 def extrapolated(
     now: Move, change: Move, before: Move, weight: Float[Array, "n B"]
 ) -> Float[Array, "n B"]:
-    """Impulses from which descent would have no way to go, by Anderson's method of depth 2.
+    """Impulses from which descent would have no way to go, by Anderson's method of
+    depth 2.
 
-    `change`, `before`: by how much moves differed now and a sweep ago. The numbers c that make
-    `way - c_1 change.way - c_2 before.way` least, in a metric with the weights, give the impulses
-    `reached - c_1 change.reached - c_2 before.reached`.
+    `change`, `before`: by how much moves differed now and a sweep ago. The numbers c
+    that make `way - c_1 change.way - c_2 before.way` least, in a metric with the
+    weights, give the impulses `reached - c_1 change.reached - c_2 before.reached`.
     """
 
     def dot(a: Float[Array, "n B"], b: Float[Array, "n B"]) -> Float[Array, "1 B"]:
         """Scalar products `sum_i weight_i a_i b_i` over the rows."""
         return jnp.sum(weight * a * b, axis=0, keepdims=True)
 
-    # normal equations [aa ab; ab bb] c = [a; b]; only c_1 where both changes are parallel
-    aa, ab, bb = (dot(*x) for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2))
+    # normal equations [aa ab; ab bb] c = [a; b]; only c_1 where both changes are
+    # parallel
+    aa, ab, bb = (
+        dot(*x)
+        for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2)
+    )
     both = aa * bb - ab**2 > precision(weight.dtype).eps * aa * bb
-    aa, bb = jnp.where(aa > 0, aa, 1.0), jnp.where(both, bb, 1.0)
+    aa = jnp.where(aa > 0, aa, 1.0)
+    bb = jnp.where(both, bb, 1.0)
     ab = jnp.where(both, ab, 0.0)
-    a, b = dot(change.way, now.way), jnp.where(both, dot(before.way, now.way), 0.0)
+    a = dot(change.way, now.way)
+    b = jnp.where(both, dot(before.way, now.way), 0.0)
     determinant = aa * bb - ab**2
-    first, second = (a * bb - b * ab) / determinant, (b * aa - a * ab) / determinant
+    first = (a * bb - b * ab) / determinant
+    second = (b * aa - a * ab) / determinant
     return now.reached - first * change.reached - second * before.reached
 
 
@@ -151,15 +174,16 @@ def solve(
 ) -> tuple[Float[Array, "n B"], Float[Array, "1 B"]]:
     """Impulses q that leave velocities right to `tolerance`, from a guess `start`.
 
-    And by how much the last sweep still changed velocities. Tangents solve the tangent equations of
-    the problem, with one matrix for all directions.
+    And by how much the last sweep still changed velocities. Tangents solve the tangent
+    equations of the problem, with one matrix for all directions.
     """
 
     class Sweep(NamedTuple):
         """State of the iteration."""
 
         ahead: Float[Array, "n B"]  # impulses that the sweep starts from
-        velocities: Float[Array, "n B"]  # there; kept, as XLA would compute them in each use
+        # there; kept, as XLA would compute them in each use
+        velocities: Float[Array, "n B"]
         last: Move  # of the sweep before
         change: Move  # its difference from the move before it
         impulses: Float[Array, "n B"]  # admissible ones
@@ -173,10 +197,14 @@ def solve(
         return (s.done < SWEEPS) & jnp.any(s.error > tolerance)
 
     def sweep(s: Sweep) -> Sweep:
-        """State after one step of descent, and the extrapolation from it and the two before it."""
+        """State after one step of descent, and the extrapolation from it and the two
+        before it.
+        """
         reached = problem.projected(s.ahead - problem.descent * s.velocities)
         now = Move(reached, reached - s.ahead)
-        changes = jax.tree.map(lambda a, b: jnp.where(s.done > 0, a - b, 0.0), now, s.last)
+        changes = jax.tree.map(
+            lambda a, b: jnp.where(s.done > 0, a - b, 0.0), now, s.last
+        )
         ahead = extrapolated(now, changes, s.change, weight)
         error = jnp.max(jnp.abs(weight * now.way), axis=0, keepdims=True)
         right = s.error <= tolerance  # such lanes keep what they have
@@ -187,7 +215,9 @@ def solve(
 
     none = Move(*[jnp.zeros_like(start)] * 2)
     wrong = jnp.full_like(tolerance, jnp.inf)
-    first = Sweep(start, problem.velocities(start), none, none, start, wrong, jnp.asarray(0))
+    first = Sweep(
+        start, problem.velocities(start), none, none, start, wrong, jnp.asarray(0)
+    )
     end = jax.lax.while_loop(going, sweep, first)
     return end.impulses, end.error
 
@@ -195,16 +225,20 @@ def solve(
 @solve.defjvp
 @full_precision
 def _solve_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """Tangent dq of the impulses, from `R(q) = q - projected(q - d w(q)) = 0`: R_q dq = -dR.
+    """Tangent dq of the impulses, from `R(q) = q - projected(q - d w(q)) = 0`: R_q dq =
+    -dR.
 
     The error that is left has no tangent.
     """
-    problem, (change, _, _) = primals[0], tangents
+    problem = primals[0]
+    change, _, _ = tangents
     impulses, left = solve(*primals)
 
     def reached(problem: StepProblem) -> Float[Array, "n B"]:
         """`projected(q - d w(q))` of the problem at the impulses q of the solution."""
-        return problem.projected(impulses - problem.descent * problem.velocities(impulses))
+        return problem.projected(
+            impulses - problem.descent * problem.velocities(impulses)
+        )
 
     _, right = jax.jvp(reached, (problem,), (change,))
     ridge = jnp.full_like(impulses, RIDGE)

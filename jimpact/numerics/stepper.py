@@ -1,32 +1,35 @@
-"""One event-aligned stepper for every flow with modes: no step straddles a change of mode.
+"""One event-aligned stepper for every flow with modes: no step straddles a change of
+mode.
 
-LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole numbers;
-per-impact scalars have shape (1, B). One impact is a batch of one.
+LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole
+numbers; per-impact scalars have shape (1, B). One impact is a batch of one.
 
-PROTOCOL   A flow is a pytree of parameters (arrays (.., B)): see `Flow`. It defines `field`,
-`margins`, `switch`, `over` and a tolerance, and overrides the defaults that do not fit.
+PROTOCOL   A flow is a pytree of parameters (arrays (.., B)): see `Flow`. It defines
+`field`, `margins`, `switch`, `over` and a tolerance, and overrides the defaults that do
+not fit.
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 
     N = 2 xi where xi is a root, else 1;   R = dc_k/dt on landings, else 1.
 
-A landing on margin k runs from xi = c_k (or its root) to exactly 0 (M. Henon, On the numerical
-computation of Poincare maps, Physica D 5, 1982): no root is searched for, and the length of the
-step has derivatives. An event where a step begins is a landing of length 0; an
-explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so there are no
-jump rules, also where events coincide.
+A landing on margin k runs from xi = c_k (or its root) to exactly 0 (M. Henon, On the
+numerical computation of Poincare maps, Physica D 5, 1982): no root is searched for, and
+the length of the step has derivatives. An event where a step begins is a landing of
+length 0; an
+explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so
+there are no jump rules, also where events coincide.
 
-WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a distance in units of
-the step just tried; the most urgent one decides (`advance`).
+WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a distance in
+units of the step just tried; the most urgent one decides (`advance`).
 
-DERIVATIVES   In forward mode the state carries tangents (`tangents.py`); step sizes and events
-depend on values, not on tangents. `step_again` is an accepted step once more, with all decisions
-fixed.
+DERIVATIVES   In forward mode the state carries tangents (`tangents.py`); step sizes and
+events depend on values, not on tangents. `step_again` is an accepted step once more,
+with all decisions fixed.
 
-COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
-reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
-b gives margins and their rates at the end of a step), and per-impact scalars are rows of two
-arrays, `Step.clock` and `StepperState.progress`.
+COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or
+quotient, every reduction, every array that a loop carries. So the field occurs once (a
+13th stage with the weights b gives margins and their rates at the end of a step), and
+per-impact scalars are rows of two arrays, `Step.clock` and `StepperState.progress`.
 """
 
 import abc
@@ -45,50 +48,60 @@ from jimpact.numerics.tangents import Dual, dual_like, is_dual, pushforward, val
 from jimpact.tools.loops import cond, scan
 from jimpact.tools.precision import precision
 
-# Step-size control: a step is at most GROWTH times and at least SHRINK times the one before it, and
-# SAFETY times what its error allows. More growth or less safety: more rejected steps.
-GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8
-# First step, in the time of the fastest contact, which cannot turn around so soon. Ten times more
-# could step over its first event.
+# Step-size control: a step is at most GROWTH times and at least SHRINK times the one
+# before it, and SAFETY times what its error allows. More growth or less safety: more
+# rejected steps.
+GROWTH = 6.0
+SHRINK = 0.2
+SAFETY = 0.8
+# First step, in the time of the fastest contact, which cannot turn around so soon. Ten
+# times more could step over its first event.
 FIRST = 0.05
-# First rooted step after a contact has closed, as a part of the step before; ten times more:
-# rejected.
+# First rooted step after a contact has closed, as a part of the step before; ten times
+# more: rejected.
 RESTART = 0.1
-# Part of the way to an event that a step is shortened to where it cannot land on it. At 1 it ends
-# at the event and may step over it again.
+# Part of the way to an event that a step is shortened to where it cannot land on it. At
+# 1 it ends at the event and may step over it again.
 CUT = 0.7
-# A flow with `near` lands where the event is at most this many times `near` ahead, in steps. Such a
-# landing evaluates costly margins in each stage; ten times more makes it longer.
+# A flow with `near` lands where the event is at most this many times `near` ahead, in
+# steps. Such a landing evaluates costly margins in each stage; ten times more makes it
+# longer.
 REACH = 5
-# Part of a step's change of slope by which its minimum may lie lower than its cubic. Ten times
-# more: steps are shortened for margins that do not dip.
+# Part of a step's change of slope by which its minimum may lie lower than its cubic.
+# Ten times more: steps are shortened for margins that do not dip.
 DOUBT = 0.01
-# Step that cannot be distinguished from none, in the flow's own time; ten times more gives up
-# earlier.
+# Step that cannot be distinguished from none, in the flow's own time; ten times more
+# gives up earlier.
 SHORTEST = 1e-13
-# Part of a step within which events are simultaneous, and are taken in the order of their rows. Ten
-# times more is still far below the tolerance.
+# Part of a step within which events are simultaneous, and are taken in the order of
+# their rows. Ten times more is still far below the tolerance.
 TIE = 1e-13
-# Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
-# with the number of passes, or the errors of N steps would add up to N tolerances.
+# Passes per contact at the full local tolerance, which ordinary impacts end within.
+# Then it falls with the number of passes, or the errors of N steps would add up to N
+# tolerances.
 FULL = 30
 # Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3.
 POLISH = 2
-# The error is no less than this part of the third-order estimate squared. Ten times more: steps
-# half as long.
+# The error is no less than this part of the third-order estimate squared. Ten times
+# more: steps half as long.
 COARSE = 0.3
 
 STAGES = len(DOP853.c)
-_TABLE = np.array([[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)])
+_TABLE = np.array(
+    [[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)]
+)
 _NODES = np.array([*DOP853.c, 1.0])
 _WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
 
 
 class Flow(abc.ABC):
-    """A differential equation to be integrated: a state y, and modes that change at events."""
+    """A differential equation to be integrated: a state y, and modes that change at
+    events.
+    """
 
     tolerance: Float[Array, "1 B"]  # error of a step
-    taking_part: Float[Array, "1 B"] | int  # contacts, without those that are open for good
+    # contacts, without those that are open for good
+    taking_part: Float[Array, "1 B"] | int
     longest: Any  # the longest step in the flow's own time that is stable, or inf
 
     near: float = 0.0  # share of a step from which landings start, 0: from anywhere
@@ -131,19 +144,26 @@ class Flow(abc.ABC):
     ) -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
         """Margins c(y) and their rates (dc/dy) dy while y changes at the rates dy.
 
-        Those of the `target` of a landing have to be exact, others are looked at to predict events.
+        Those of the `target` of a landing have to be exact, others are looked at to
+        predict events.
         """
         return jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))
 
     @abc.abstractmethod
     def switch(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state after the events `which`, one-hot."""
 
     @abc.abstractmethod
     def over(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], passes: Float[Array, "1 B"]
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"]:
         """Mask of the impacts in which nothing is left to integrate."""
 
@@ -158,7 +178,9 @@ class Flow(abc.ABC):
         return 1.0
 
     def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "#k #B"]:
-        """Mask of the margins whose root is the variable of a landing: by default none."""
+        """Mask of the margins whose root is the variable of a landing: by default
+        none.
+        """
         return jnp.zeros((1, 1), bool)
 
     def begins(
@@ -168,7 +190,9 @@ class Flow(abc.ABC):
         return jnp.zeros((1, 1), bool)
 
     def coasts(self, modes: Int[Array, "modes B"]) -> Bool[Array, "1 B"] | None:
-        """Mask: the field is constant, so that steps of any length are exact; None: it never is."""
+        """Mask: the field is constant, so that steps of any length are exact; None: it
+        never is.
+        """
         return None
 
     def pauses(
@@ -177,7 +201,9 @@ class Flow(abc.ABC):
         after: Int[Array, "modes B"],
         passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"] | None:
-        """Mask of the impacts that the caller has to inspect after this pass; None: none, ever."""
+        """Mask of the impacts that the caller has to inspect after this pass; None:
+        none, ever.
+        """
         return None
 
     def finish(
@@ -203,7 +229,9 @@ def _rows(x: Float[Array, "k B"]) -> list[Float[Array, "1 B"]]:
 
 
 def put(
-    buffer: Shaped[Array, "count *rows"], value: Shaped[Array, "*rows"], index: Integer[Array, ""]
+    buffer: Shaped[Array, "count *rows"],
+    value: Shaped[Array, "*rows"],
+    index: Integer[Array, ""],
 ) -> Shaped[Array, "count *rows"]:
     """The buffer with `value` in the row `index`."""
     return jax.lax.dynamic_update_slice_in_dim(
@@ -216,7 +244,8 @@ class Step(NamedTuple):
 
     modes: Int[Array, "modes B"]
     target: Bool[Array, "k B"]  # one-hot: the margin it lands on; none: a step in time
-    clock: Float[Array, "4 B"]  # xi at the beginning, length, 1 if xi is a root, 1 if it lands
+    # xi at the beginning, length, 1 if xi is a root, 1 if it lands
+    clock: Float[Array, "4 B"]
 
 
 class _StepVariable(NamedTuple):
@@ -233,8 +262,8 @@ def _frame(
 ) -> tuple[Any, Float[Array, "k B"], _StepVariable]:
     """Constants of the flow, margins at the beginning, and the variable xi of the step.
 
-    In time xi runs from the `start` of the clock for its length h; on a landing from c, the margin
-    at the beginning, or its root, to 0.
+    In time xi runs from the `start` of the clock for its length h; on a landing from c,
+    the margin at the beginning, or its root, to 0.
     """
     variable_at_start, h, in_root, lands = _rows(s.clock)
     const = flow.constants(s.modes)
@@ -245,14 +274,23 @@ def _frame(
     xi0 = total(jnp.where(s.target, xi0, 0.0))
     rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + in_root
     start = jnp.where(lands > 0, xi0, variable_at_start)
-    # a margin that counts as 0 takes no time, however slow it is; its derivatives remain
+    # a margin that counts as 0 takes no time, however slow it is; its derivatives
+    # remain
     zero_length = (lands > 0) & (jnp.abs(xi0) <= flow.zero_margin)
-    length = jnp.where(zero_length, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
-    return const, jax.lax.stop_gradient(c0), _StepVariable(start, length, rooted, zero_length)
+    length = jnp.where(
+        zero_length, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h)
+    )
+    return (
+        const,
+        jax.lax.stop_gradient(c0),
+        _StepVariable(start, length, rooted, zero_length),
+    )
 
 
 class _StepResult(NamedTuple):
-    """Change over a step, its error, and the margins c with their rates dc/dt at both ends."""
+    """Change over a step, its error, and the margins c with their rates dc/dt at both
+    ends.
+    """
 
     change: Any  # of y and of time (n + 1, B)
     errors: Float[Array, "2 n B"]  # both estimates of the error of y
@@ -269,10 +307,11 @@ def _slopes(
     stage: Any,
     ends: np.ndarray,
 ) -> tuple[list[Float[Array, "_ B"]], tuple[Float[Array, "k B"], Float[Array, "k B"]]]:
-    """Slopes in a stage: `dy/dxi = dy dt/dxi` in blocks of rows that end at `ends`, then dt/dxi.
+    """Slopes in a stage: `dy/dxi = dy dt/dxi` in blocks of rows that end at `ends`,
+    then dt/dxi.
 
-    And the margins and their rates in the flow's own time. The stage is its number, its node c_i,
-    and the sum `sum_j a_ij k_j` of slopes that leads to its state.
+    And the margins and their rates in the flow's own time. The stage is its number, its
+    node c_i, and the sum `sum_j a_ij k_j` of slopes that leads to its state.
     """
     i, node, change = stage
     lands = s.clock[3:4]
@@ -299,14 +338,21 @@ def _slopes(
 
 
 def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
-    """One step of the Runge-Kutta method; rates and margins at the end only where it `ends`.
+    """One step of the Runge-Kutta method; rates and margins at the end only where it
+    `ends`.
 
     Where `flow` or y has tangents (see `tangents.py`) the change has some, too.
     """
     plain, state = value_of((flow, y))
-    n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
+    n = state.shape[0]
+    dtype = state.dtype
+    batch = state.shape[1:]
     const, c0, frame = pushforward(lambda flow, y: _frame(flow, s, y), flow, y)
-    count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
+    # the 13th evaluation, that of the end, has no weight
+    if ends:
+        count = STAGES + 1
+    else:
+        count = STAGES
     adds = sum(plain.adding)
     blocks = plain.driving or (n - adds,)
     ends_of = np.cumsum([0, *blocks, *plain.adding])
@@ -321,8 +367,14 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
         )
         return (new[: len(blocks)], new[len(blocks) :]), margins
 
-    row = [dual_like((flow, y), jnp.zeros((1, k, *batch), dtype)) for k in (n - adds, adds + 1)]
-    stages = _scanned if jax.default_backend() == "cpu" else _written_out
+    row = [
+        dual_like((flow, y), jnp.zeros((1, k, *batch), dtype))
+        for k in (n - adds, adds + 1)
+    ]
+    if jax.default_backend() == "cpu":
+        stages = _scanned
+    else:
+        stages = _written_out
     tables, (d0, c1, d1) = stages(evaluate, row, count, jnp.zeros_like(s.target, dtype))
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
     change, errors = _weighted(tables, weights, frame.length)
@@ -332,25 +384,34 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
 def _scanned(
     evaluate: Any, row: list[Any], count: int, none: Float[Array, "k B"]
 ) -> tuple[Any, Any]:
-    """Slopes of all stages in two tables (count, rows, B), and margins at both ends, by a scan.
+    """Slopes of all stages in two tables (count, rows, B), and margins at both ends, by
+    a scan.
 
-    `row` has an empty row (1, rows, B) of each table. Of the margins: rates in the first stage,
-    values and rates in the last, from `none`. One kernel for all stages: it compiles quickly.
+    `row` has an empty row (1, rows, B) of each table. Of the margins: rates in the
+    first stage, values and rates in the last, from `none`. One kernel for all stages:
+    it compiles quickly.
     """
     dtype = none.dtype
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
 
     def stage(carry: Any, at: Any) -> tuple[Any, None]:
-        """Tables with the slopes of stage i, whose state follows from those of earlier stages."""
+        """Tables with the slopes of stage i, whose state follows from those of earlier
+        stages.
+        """
         slopes, added, first, *_ = carry
         i, weights, node = at
         change = jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), slopes)
         (new, new_added), (value, dc) = evaluate(i, node, change)
-        slopes, added = _with_row(slopes, new, i), _with_row(added, new_added, i)
+        slopes = _with_row(slopes, new, i)
+        added = _with_row(added, new_added, i)
         return (slopes, added, jnp.where(i == 0, dc, first), value, dc), None
 
     tables = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), dtype), row)
-    each = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
+    each = (
+        jnp.arange(count, dtype=jnp.uint32),
+        table,
+        jnp.asarray(_NODES[:count], dtype),
+    )
     (slopes, added, *margins), _ = scan(stage, (*tables, none, none, none), each)
     return [slopes, added], margins
 
@@ -360,8 +421,9 @@ def _written_out(
 ) -> tuple[Any, Any]:
     """Slopes and margins as `_scanned`, each stage with kernels of its own.
 
-    On a GPU the tables that a scan carries pass through memory in every stage, for twice the time
-    of an impact. On a CPU this is no faster, and compiles for two to four times as long.
+    On a GPU the tables that a scan carries pass through memory in every stage, for
+    twice the time of an impact. On a CPU this is no faster, and compiles for two to
+    four times as long.
     """
     tables: list[list[Any]] = [[], []]
     margins = []
@@ -370,7 +432,9 @@ def _written_out(
         change = jax.tree.map(lambda x: x[0], row[0])
         if used.size:
             change = jax.tree.map(
-                lambda *k, i=i, used=used: sum(float(_TABLE[i, j]) * x[0] for j, x in zip(used, k)),
+                lambda *k, i=i, used=used: sum(
+                    float(_TABLE[i, j]) * x[0] for j, x in zip(used, k)
+                ),
                 *(tables[0][j] for j in used),
             )
         node = jnp.asarray(_NODES[i], none.dtype)
@@ -387,19 +451,25 @@ def _weighted(
 ) -> tuple[Any, Float[Array, "2 _ B"]]:
     """Change over a step (n + 1, B), and two estimates of its error, from all slopes.
 
-    Equation: `h sum_i b_i k_i`, with the weights b of the method, then of both estimates.
+    Equation: `h sum_i b_i k_i`, with the weights b of the method, then of both
+    estimates.
     """
     sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in tables]
     inner, outer = (
-        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1)) if is_dual(k) else x[0]
+        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1))
+        if is_dual(k)
+        else x[0]
         for x, k in zip(sums, tables)
     )
     change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
-    return change, value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)
+    return change, value_of(length)[None] * jnp.concatenate(
+        [x[1:] for x in sums], axis=1
+    )
 
 
 def _with_row(table: Any, new: list[Any], i: Integer[Array, ""]) -> Any:
-    """The table of slopes (count, rows, B) with `new`, a list of blocks of rows, as its row i.
+    """The table of slopes (count, rows, B) with `new`, a list of blocks of rows, as its
+    row i.
 
     Each block of tangents is a kernel: one for all would compute them entry by entry.
     """
@@ -407,7 +477,9 @@ def _with_row(table: Any, new: list[Any], i: Integer[Array, ""]) -> Any:
     value = put(value, jnp.concatenate(value_of(new)), i)
     if not is_dual(table):
         return value
-    tangents, first, none = table.tangents, 0, jnp.zeros((), i.dtype)
+    tangents = table.tangents
+    first = 0
+    none = jnp.zeros((), i.dtype)
     for block in new:
         if is_dual(block):  # else its tangents are 0
             at = (i, jnp.asarray(first, i.dtype), none, none)
@@ -419,7 +491,9 @@ def _with_row(table: Any, new: list[Any], i: Integer[Array, ""]) -> Any:
 
 
 class Mark(enum.IntEnum):
-    """State of an impact: it goes on, is over, or waits until the caller has inspected it."""
+    """State of an impact: it goes on, is over, or waits until the caller has inspected
+    it.
+    """
 
     GOES_ON = 0
     OVER = 1
@@ -427,15 +501,17 @@ class Mark(enum.IntEnum):
 
 
 class Intention(enum.IntEnum):
-    """Purpose of the next step for a margin, the most urgent first; the meaning of its distance.
+    """Purpose of the next step for a margin, the most urgent first; the meaning of its
+    distance.
 
-    The numbers leave a gap for distances from 0 to 1 between them: their sum is the order of
-    urgency.
+    The numbers leave a gap for distances from 0 to 1 between them: their sum is the
+    order of urgency.
     """
 
     SHORTEN = -2  # it dips, or cannot be landed on from here: at this part of the step
     LAND = 0  # it vanishes at this part of the step: repeat the step as a landing on it
-    AHEAD = 1  # expected to vanish this many steps ahead: land on it if the next step reaches it
+    # expected to vanish this many steps ahead: land on it if the next step reaches it
+    AHEAD = 1
 
 
 class StepperState(NamedTuple):
@@ -443,8 +519,8 @@ class StepperState(NamedTuple):
 
     y: Any  # (n, B), which may be `Dual`
     step: Step  # the one to try
-    # (4, B): time it is expected to take; whether a landing already had to aim at another event;
-    # `Mark`; number of passes
+    # (4, B): time it is expected to take; whether a landing already had to aim at
+    # another event; `Mark`; number of passes
     progress: Float[Array, "4 B"]
 
     @property
@@ -461,24 +537,31 @@ class StepperState(NamedTuple):
         """The state with this `Mark` where `which` is True."""
         old = self.progress[2:3]
         new = jnp.where(which, jnp.asarray(mark, old.dtype), old)
-        return self._replace(progress=self.progress.at[2:3].set(jax.lax.stop_gradient(new)))
+        return self._replace(
+            progress=self.progress.at[2:3].set(jax.lax.stop_gradient(new))
+        )
 
 
 def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
     """The state before the first pass.
 
-    The first step is short and advances in the root of time, as forces start as a power of it.
+    The first step is short and advances in the root of time, as forces start as a power
+    of it.
     """
     start = dual_like((flow, start), start)
     flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
     # xi = 0, a length in the root of time, no landing
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
-    targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
+    targets = jax.eval_shape(
+        lambda: flow.margins(flow.constants(modes), modes, y)
+    ).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
     mark = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
-    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one]))
+    return StepperState(
+        start, step, jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one])
+    )
 
 
 def goes_on(carry: StepperState, most: int) -> Bool[Array, "1 B"]:
@@ -486,12 +569,16 @@ def goes_on(carry: StepperState, most: int) -> Bool[Array, "1 B"]:
     return (carry.mark == Mark.GOES_ON) & (carry.passes < most)
 
 
-def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, Bool[Array, "1 B"]]:
+def advance(
+    flow: Flow, state: StepperState, most: int
+) -> tuple[StepperState, Bool[Array, "1 B"]]:
     """Try one step; accept it, or shorten it, or repeat it so that it ends at an event.
 
     Returns the state for the next pass, and a mask of the impacts that accept the step.
     """
-    duals, start, s = flow, state.y, state.step
+    duals = flow
+    start = state.y
+    s = state.step
     flow, y = value_of((flow, start))  # without tangents
     n = y.shape[0]
     expected, aimed_twice, mark, passes = _rows(state.progress)
@@ -507,13 +594,16 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, B
     accept = ok & (urgent.intention == Intention.AHEAD) & active
     landed = accept & (lands > 0)
     events = s.target & landed  # one-hot
-    # the field has no value, however short the step: given up, and the status reports it
+    # the field has no value, however short the step: given up, and the status reports
+    # it
     broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
 
     def after(
         flow: Flow, y: Float[Array, "n B"], change: Float[Array, "_ B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state after an accepted step; else the state before, or NaN if `broken`."""
+        """Modes and state after an accepted step; else the state before, or NaN if
+        `broken`.
+        """
         modes, end = flow.switch(s.modes, y + change[:n], events)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
@@ -522,11 +612,16 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, B
     step, next_duration = _next_step(flow, s, modes, urgent, accept, error2, duration)
     passes = passes + active.astype(y.dtype)
     pauses = flow.pauses(s.modes, modes, passes)
-    mark = mark if pauses is None else jnp.where(active & pauses, Mark.PAUSED, mark)
+    if pauses is not None:
+        mark = jnp.where(active & pauses, Mark.PAUSED, mark)
     over = flow.over(modes, value_of(end), passes) | broken
-    aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < Intention.AHEAD)
+    aimed_twice = (
+        (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < Intention.AHEAD)
+    )
     mark = jnp.where(over, Mark.OVER, mark)
-    progress = jnp.concatenate([next_duration, aimed_twice.astype(y.dtype), mark, passes])
+    progress = jnp.concatenate(
+        [next_duration, aimed_twice.astype(y.dtype), mark, passes]
+    )
     return StepperState(end, *jax.lax.stop_gradient((step, progress))), accept
 
 
@@ -539,7 +634,8 @@ def _squared_error(
 ) -> Float[Array, "1 B"]:
     """Hairer's error of a step, squared, in tolerances.
 
-    Equation: `e5^4 / (e5^2 + 0.01 e3^2)` of the largest scaled errors e5 and e3 of both estimates.
+    Equation: `e5^4 / (e5^2 + 0.01 e3^2)` of the largest scaled errors e5 and e3 of both
+    estimates.
     """
     zero = precision(y.dtype)
     full = FULL * flow.taking_part
@@ -548,7 +644,8 @@ def _squared_error(
     fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
     # 0.01 is Hairer's; `tiny`: a landing of length 0 has no errors
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + zero.tiny)
-    # small by chance where the fifth order is: a landing from a maximum, a step of half a period
+    # small by chance where the fifth order is: a landing from a maximum, a step of half
+    # a period
     return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
 
 
@@ -559,7 +656,8 @@ def _intentions(
     values: tuple[Float[Array, "k B"], Float[Array, "k B"]],
     slopes: tuple[Float[Array, "k B"], Float[Array, "k B"]],
 ) -> tuple[Int[Array, "k B"], Float[Array, "k B"]]:
-    """Intention and distance of each margin, from values and slopes at both ends of a step.
+    """Intention and distance of each margin, from values and slopes at both ends of a
+    step.
 
     In units of the step, with v = 1 - u, a margin within the step is Hermite's cubic
 
@@ -567,24 +665,36 @@ def _intentions(
 
     and at the distance w behind its end the parabola c1 + d1 w + (d1 - d0) w^2 / 2.
     """
-    (c0, c1), (d0, d1) = values, slopes
-    zero, lands = flow.zero_margin, s.clock[3:4] > 0
+    c0, c1 = values
+    d0, d1 = slopes
+    zero = flow.zero_margin
+    lands = s.clock[3:4] > 0
     free = ~s.target
-    crossed, turns = free & (c1 < -zero), free & (d0 < 0) & (d1 > 0) & (c0 > zero)
+    crossed = free & (c1 < -zero)
+    turns = free & (d0 < 0) & (d1 > 0) & (c0 > zero)
     u = _place_within(flow, crossed, values, slopes)
     v = 1 - u
     minimum = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
     dipped = turns & (minimum < DOUBT * (d1 - d0) - zero)
     at_once = (c0 <= zero) & (d0 <= 0)
-    direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > zero))
+    if flow.near:
+        direct = at_once
+    else:
+        direct = at_once | ((d0 < 0) & (c0 > zero))
     direct = direct & (aimed_twice == 0)
     # the parabola has no root where a margin only creeps towards 0
     discriminant = d1 * d1 - 2 * (d1 - d0) * c1
     ahead = free & ~turns & (d1 < 0) & (c1 > zero) & (discriminant > 0) & ~lands
-    w = 2 * c1 / (jnp.sqrt(jnp.where(ahead, discriminant, 1.0)) - jnp.where(ahead, d1, 0.0))
+    w = (
+        2
+        * c1
+        / (jnp.sqrt(jnp.where(ahead, discriminant, 1.0)) - jnp.where(ahead, d1, 0.0))
+    )
     w = jnp.where(ahead, w, jnp.inf)
     intention = jnp.where(dipped, Intention.SHORTEN, Intention.AHEAD)
-    intention = jnp.where(crossed, jnp.where(direct, Intention.LAND, Intention.SHORTEN), intention)
+    intention = jnp.where(
+        crossed, jnp.where(direct, Intention.LAND, Intention.SHORTEN), intention
+    )
     u = jnp.where(crossed & direct & at_once, 0.0, u)
     return intention, jnp.where(crossed | dipped, u, w)
 
@@ -595,20 +705,25 @@ def _place_within(
     values: tuple[Float[Array, "k B"], Float[Array, "k B"]],
     slopes: tuple[Float[Array, "k B"], Float[Array, "k B"]],
 ) -> Float[Array, "k B"]:
-    """Places u in a step at which margins vanish if they have `crossed` 0, otherwise turn."""
-    (c0, c1), (d0, d1) = values, slopes
+    """Places u in a step at which margins vanish if they have `crossed` 0, otherwise
+    turn.
+    """
+    c0, c1 = values
+    d0, d1 = slopes
     # the root of the chord c0 + (c1 - c0) u, or of the slope d0 + (d1 - d0) u
     above = jnp.maximum(c0, 0.0)
     part = jnp.where(crossed, above, -d0)
     whole = jnp.where(crossed, c0 - c1, d1 - d0)
     u = part / jnp.where(whole > 0, whole, jnp.inf)
-    # a margin that rises and falls back: the root of the parabola c0 + d0 u + (c1 - c0 - d0) u^2
+    # a margin that rises and falls back: the root of the parabola c0 + d0 u + (c1 - c0
+    # - d0) u^2
     rises = crossed & (d0 > 0)
     bend = jnp.where(rises, above + d0 - c1, 1.0)
     root = jnp.sqrt(jnp.where(rises, d0 * d0 + 4 * bend * above, 1.0))
     u = jnp.where(rises, (d0 + root) / (2 * bend), u)
     if flow.near:
-        # a step in time precedes the landing: dt/dxi is singular at the top of a parabola
+        # a step in time precedes the landing: dt/dxi is singular at the top of a
+        # parabola
         u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
     return u
 
@@ -621,10 +736,18 @@ class _Urgent(NamedTuple):
     target: Bool[Array, "k B"]  # one-hot
 
 
-def _most_urgent(intention: Int[Array, "k B"], distance: Float[Array, "k B"]) -> _Urgent:
-    """The margin of least intention and, of equal ones, of least distance; ties go by the row."""
+def _most_urgent(
+    intention: Int[Array, "k B"], distance: Float[Array, "k B"]
+) -> _Urgent:
+    """The margin of least intention and, of equal ones, of least distance; ties go by
+    the row.
+    """
     # below 0: SHORTEN; from 0 to 1: LAND at this part of the step; above: AHEAD
-    order = intention + distance + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
+    order = (
+        intention
+        + distance
+        + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
+    )
     first = jnp.min(order, axis=0, keepdims=True)
     not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
     chosen = jnp.where(first < Intention.LAND, Intention.SHORTEN, not_before)
@@ -645,7 +768,9 @@ def _next_step(
     `duration` is the time that `s` takes, `error2` its error in tolerances, squared.
     """
     start, length, in_root, lands = _rows(s.clock)
-    ok, event, lands = error2 <= 1, urgent.intention < Intention.AHEAD, lands > 0
+    ok = error2 <= 1
+    event = urgent.intention < Intention.AHEAD
+    lands = lands > 0
     # xi goes on from the end of an accepted step
     in_root = (in_root > 0) & ~lands
     start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
@@ -656,7 +781,8 @@ def _next_step(
     proposed = jnp.where(lands, after_landing, _length_from_error(length, error2))
     proposed = jnp.where(ok & event, at_event, proposed)
     closed = accept & flow.begins(s.modes, modes)
-    in_root, start = in_root | closed, jnp.where(closed, 0.0, start)
+    in_root = in_root | closed
+    start = jnp.where(closed, 0.0, start)
     proposed = _restart_in_root(closed, duration, proposed)
     proposed = jnp.where(in_root, proposed, jnp.minimum(proposed, flow.longest))
     # xi is the root of time: from `start` on a step takes this long
@@ -674,7 +800,9 @@ def _next_step(
 def _length_from_error(
     length: Float[Array, "1 B"], error2: Float[Array, "1 B"]
 ) -> Float[Array, "1 B"]:
-    """The length at which the error would be SAFETY^8 tolerances, as error ~ length^8."""
+    """The length at which the error would be SAFETY^8 tolerances, as error ~
+    length^8.
+    """
     # four roots: error^(1/8) = error2^(1/16); 1e-20 keeps it from 0, far beyond GROWTH
     eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20))))
     factor = jnp.clip(SAFETY / eighth_root, SHRINK, GROWTH)
@@ -690,17 +818,29 @@ def _shorter_length(
     duration: Float[Array, "1 B"],
 ) -> Float[Array, "1 B"]:
     """The length that ends before an event, or half of the time of a failed landing."""
-    part = 1 - flow.near if flow.near else CUT
-    cut = jnp.where(ok & (urgent.intention == Intention.SHORTEN), part * urgent.distance, 0.5)
-    length, lands = s.clock[1:2], s.clock[3:4] > 0
+    if flow.near:
+        part = 1 - flow.near
+    else:
+        part = CUT
+    cut = jnp.where(
+        ok & (urgent.intention == Intention.SHORTEN), part * urgent.distance, 0.5
+    )
+    length = s.clock[1:2]
+    lands = s.clock[3:4] > 0
     # a landing is not in time: the shorter step is
-    return jnp.where(in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length))
+    return jnp.where(
+        in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length)
+    )
 
 
 def _restart_in_root(
-    closed: Bool[Array, "1 B"], duration: Float[Array, "1 B"], length: Float[Array, "1 B"]
+    closed: Bool[Array, "1 B"],
+    duration: Float[Array, "1 B"],
+    length: Float[Array, "1 B"],
 ) -> Float[Array, "1 B"]:
-    """The length, but of the first step after a contact has `closed` in the root of time."""
+    """The length, but of the first step after a contact has `closed` in the root of
+    time.
+    """
     restart = jnp.sqrt(jnp.minimum(RESTART * duration, FIRST))
     return jnp.where(closed & (restart > 0), restart, length)
 
@@ -717,7 +857,9 @@ def _reaches_event(
     coasts = flow.coasts(modes)
     if coasts is not None:
         reached = reached | (coasts & (distance < jnp.inf))
-    return reached & (distance < REACH * flow.near) if flow.near else reached
+    if flow.near:
+        return reached & (distance < REACH * flow.near)
+    return reached
 
 
 def _root_of_cubic(
@@ -729,11 +871,13 @@ def _root_of_cubic(
 ) -> Float[Array, "k B"]:
     """The root in [0, 1] near u of the cubic with values c and slopes d at 0 and 1.
 
-    By Newton's method on `c0 v + c1 u + u v (v a + u b)`, v = 1 - u, a = d0 - (c1 - c0),
+    By Newton's method on `c0 v + c1 u + u v (v a + u b)`, v = 1 - u, a = d0 - (c1 -
+    c0),
     b = (c1 - c0) - d1.
     """
     rise = c1 - c0
-    a, b = d0 - rise, rise - d1
+    a = d0 - rise
+    b = rise - d1
     for _ in range(POLISH):
         v = 1 - u
         bend = v * a + u * b
@@ -746,11 +890,14 @@ def _root_of_cubic(
 def between(
     flow: Flow, s: Step, y: Float[Array, "n B"], ahead: Float[Array, "1 B"]
 ) -> Float[Array, "n B"]:
-    """The state within the step from y at the time `ahead` after it, in the flow's own time.
+    """The state within the step from y at the time `ahead` after it, in the flow's own
+    time.
 
     In the root xi of time, `xi^2 = xi_0^2 + ahead`.
     """
-    variable_at_start, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
+    variable_at_start = s.clock[:1]
+    in_root = s.clock[2:3]
+    lands = s.clock[3:4]
     in_root = in_root * (1 - lands)
     variable_at_start = variable_at_start * in_root
     reached = variable_at_start**2 + ahead

@@ -1,4 +1,6 @@
-"""The tangential rows of the Delassus matrix and the slip velocities: what friction acts on."""
+"""The tangential rows of the Delassus matrix and the slip velocities: what friction
+acts on.
+"""
 
 from typing import NamedTuple
 
@@ -7,9 +9,11 @@ from jaxtyping import Array, Float, Shaped
 
 
 class TangentialBlock(NamedTuple):
-    """Blocks of the Delassus matrix of m contacts with t tangents: `u+ = u- + W_nt^T p + W_tt p_t`.
+    """Blocks of the Delassus matrix of m contacts with t tangents:
+    `u+ = u- + W_nt^T p + W_tt p_t`.
 
-    t = m in the plane, 2 m in space, contact by contact; of N groups with an axis in front.
+    t = m in the plane, 2 m in space, contact by contact; of N groups with an axis in
+    front.
     """
 
     normal_tangent: Float[Array, "*N m t"]  # W_nt [1/kg]
@@ -19,7 +23,9 @@ class TangentialBlock(NamedTuple):
     def scaled(
         self, root: Float[Array, " m"], speed: Float[Array, ""] | float = 1.0
     ) -> "TangentialBlock":
-        """The block where contact j is divided by `root`, and slip by `speed` as well."""
+        """The block where contact j is divided by `root`, and slip by `speed` as
+        well.
+        """
         of_tangents = per_tangent(root, self.slip)
         return TangentialBlock(
             self.normal_tangent / (root[:, None] * of_tangents[None]),

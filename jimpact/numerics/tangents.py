@@ -1,8 +1,9 @@
 """Dual numbers with many tangents: all directions D of a derivative at one point.
 
-`vmap` over the directions would put their axis first, before the stages of a step, and every sum
-over stages would transpose the whole table of slopes. Here values are (.., B) and their tangents
-(.., D, B). A loop is written once, for values alone or with tangents; its body calls `pushforward`.
+`vmap` over the directions would put their axis first, before the stages of a step, and
+every sum over stages would transpose the whole table of slopes. Here values are (.., B)
+and their tangents (.., D, B). A loop is written once, for values alone or with
+tangents; its body calls `pushforward`.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,9 @@ def value_of(tree: Any) -> Any:
 
 
 def pushforward(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)`; results that depend on a leaf that is a `Dual` are `Dual`, too."""
+    """`function(*args)`; results that depend on a leaf that is a `Dual` are `Dual`,
+    too.
+    """
     leaves, tree = jax.tree.flatten(args, is_leaf=is_dual)
     duals = [i for i, x in enumerate(leaves) if is_dual(x)]
     if not duals:
@@ -50,7 +53,8 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
         return results
 
     def note(results: Any, tangents: Any) -> tuple[Any, Any]:
-        """Results and tangents as they are; notes in `depends` which results have tangents.
+        """Results and tangents as they are; notes in `depends` which results have
+        tangents.
 
         A tangent that is known to be 0 is symbolic.
         """
@@ -65,7 +69,9 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     def of_values(*values: jax.Array) -> list[Any]:
         """Leaves of the results, as a function of the values of the duals alone."""
         replaced = dict(zip(duals, values))
-        args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
+        args = jax.tree.unflatten(
+            tree, [replaced.get(i, x) for i, x in enumerate(leaves)]
+        )
         results, result_tree = jax.tree.flatten(function(*args))
         trees[:] = [result_tree]
         depends[:] = [False] * len(results)
@@ -74,7 +80,9 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     values = tuple(leaves[i].value for i in duals)
 
     def push(*tangents: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Results, and tangents `sum_i (df / dx_i) dx_i` of those that depend on a dual."""
+        """Results, and tangents `sum_i (df / dx_i) dx_i` of those that depend on a
+        dual.
+        """
         results, rates = jax.jvp(of_values, values, tangents)
         return results, [rate for rate, needed in zip(rates, depends) if needed]
 
@@ -82,17 +90,22 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     results, found = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))(*directions)
     rates = iter(found)
     return jax.tree.unflatten(
-        trees[0], [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
+        trees[0],
+        [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)],
     )
 
 
 def is_smooth(x: Any) -> bool:
-    """True if x is an array, or a shape, of floating-point numbers: it may have tangents."""
+    """True if x is an array, or a shape, of floating-point numbers: it may have
+    tangents.
+    """
     return bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
 def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
-    """x as a `Dual` with tangents of 0 if a leaf of the tree is a `Dual`, otherwise x."""
+    """x as a `Dual` with tangents of 0 if a leaf of the tree is a `Dual`, otherwise
+    x.
+    """
     duals = [leaf for leaf in jax.tree.leaves(tree, is_leaf=is_dual) if is_dual(leaf)]
     if not duals or isinstance(x, Dual):
         return x

@@ -1,4 +1,6 @@
-"""A symmetric tridiagonal matrix stored as its two diagonals (the Delassus matrix of a chain)."""
+"""A symmetric tridiagonal matrix stored as its two diagonals (the Delassus matrix of a
+chain).
+"""
 
 from typing import Literal
 
@@ -18,7 +20,9 @@ def tridiagonal_product(
     off_diagonal: Float[Array, "m-1 *#B"],
     vector: Float[Array, "m *#B"],
 ) -> Float[Array, "m *#B"]:
-    """`(A x)_j = d_j x_j + o_j-1 x_j-1 + o_j x_j+1`, given d_j x_j: symmetric tridiagonal A."""
+    """`(A x)_j = d_j x_j + o_j-1 x_j-1 + o_j x_j+1`, given d_j x_j: symmetric
+    tridiagonal A.
+    """
     none = jnp.zeros_like(vector[:1])
     lower = jnp.concatenate([none, off_diagonal * vector[:-1]])
     upper = jnp.concatenate([off_diagonal * vector[1:], none])
@@ -28,7 +32,8 @@ def tridiagonal_product(
 class Tridiagonal(eqx.Module):
     """Symmetric tridiagonal matrix.
 
-    `regular`: known to be regular whatever its values (a chain with no more contacts than bodies).
+    `regular`: known to be regular whatever its values (a chain with no more contacts
+    than bodies).
     """
 
     diagonal: Float[Array, "m *B"]
@@ -41,7 +46,9 @@ class Tridiagonal(eqx.Module):
         return tridiagonal_product(self.diagonal * vector, self.off_diagonal, vector)
 
     def solve(self, vector: Float[Array, " m"]) -> Float[Array, " m"]:
-        """`A^-1 vector` for a positive definite matrix, in O(m), by elimination without pivots."""
+        """`A^-1 vector` for a positive definite matrix, in O(m), by elimination without
+        pivots.
+        """
         none = jnp.zeros_like(vector[:1])
         first = jnp.ones_like(none), none, none
 
@@ -51,28 +58,38 @@ class Tridiagonal(eqx.Module):
             Equation: `d_j - f o_j-1` on the diagonal, right side `r_j - f r_j-1`.
             """
             pivot, right, before = row  # of the row above, and its off-diagonal entry
-            diagonal, known, after = entries[0][None], entries[1][None], entries[2][None]
+            diagonal = entries[0][None]
+            known = entries[1][None]
+            after = entries[2][None]
             factor = before / pivot
             reduced = diagonal - factor * before, known - factor * right, after
             return reduced, reduced
 
         after = jnp.concatenate([self.off_diagonal, none])
-        _, (pivot, right, after) = jax.lax.scan(eliminate, first, (self.diagonal, vector, after))
+        _, (pivot, right, after) = jax.lax.scan(
+            eliminate, first, (self.diagonal, vector, after)
+        )
 
         def substitute(
             x: Float[Array, "1"], row: Triple
         ) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-            """Unknown `x_j = (r_j - o_j x_j+1) / d_j` of the bidiagonal system, twice."""
+            """Unknown `x_j = (r_j - o_j x_j+1) / d_j` of the bidiagonal system,
+            twice.
+            """
             pivot, right, after = row
             x = (right - after * x) / pivot
             return x, x
 
         rows = pivot, right, after
-        return jax.lax.scan(substitute, none, rows, reverse=True)[1].reshape(vector.shape)
+        return jax.lax.scan(substitute, none, rows, reverse=True)[1].reshape(
+            vector.shape
+        )
 
     def __abs__(self) -> "Tridiagonal":
         """|A|, entry by entry."""
-        return Tridiagonal(jnp.abs(self.diagonal), jnp.abs(self.off_diagonal), self.regular)
+        return Tridiagonal(
+            jnp.abs(self.diagonal), jnp.abs(self.off_diagonal), self.regular
+        )
 
     def as_matrix(self) -> Float[Array, "m m *B"]:
         """The dense matrix."""
@@ -91,7 +108,8 @@ class Tridiagonal(eqx.Module):
 
 Symmetric = jax.Array | Tridiagonal | Sparse
 
-# Which entries off the diagonal are stored: all (None), those of a chain, or those of neighbours.
+# Which entries off the diagonal are stored: all (None), those of a chain, or those of
+# neighbours.
 Structure = Literal["chain"] | Neighbours | None
 
 
@@ -99,11 +117,15 @@ def structure_of(matrix: Symmetric) -> Structure:
     """The structure in which a matrix is stored."""
     if isinstance(matrix, Sparse):
         return matrix.neighbours
-    return "chain" if isinstance(matrix, Tridiagonal) else None
+    if isinstance(matrix, Tridiagonal):
+        return "chain"
+    return None
 
 
 def off_diagonal(matrix: Symmetric) -> Float[Array, "..."]:
-    """Entries off the diagonal: (m, K) of neighbours, (m - 1,) of a chain, upper triangle else."""
+    """Entries off the diagonal: (m, K) of neighbours, (m - 1,) of a chain, upper
+    triangle else.
+    """
     if isinstance(matrix, Sparse):
         return matrix.entries
     if isinstance(matrix, Tridiagonal):
@@ -113,12 +135,16 @@ def off_diagonal(matrix: Symmetric) -> Float[Array, "..."]:
 
 def as_matrix(matrix: Symmetric) -> Float[Array, "m m *B"]:
     """Dense form of a matrix."""
-    return matrix.as_matrix() if isinstance(matrix, (Tridiagonal, Sparse)) else matrix
+    if isinstance(matrix, (Tridiagonal, Sparse)):
+        return matrix.as_matrix()
+    return matrix
 
 
 def diagonal(matrix: Symmetric) -> Float[Array, "m *B"]:
     """Diagonal of a matrix."""
-    return matrix.diagonal if isinstance(matrix, (Tridiagonal, Sparse)) else jnp.diagonal(matrix)
+    if isinstance(matrix, (Tridiagonal, Sparse)):
+        return matrix.diagonal
+    return jnp.diagonal(matrix)
 
 
 def is_regular(matrix: Symmetric) -> bool:

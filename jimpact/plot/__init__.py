@@ -1,7 +1,8 @@
 """Pictures: one function for each kind of result; each returns a matplotlib figure.
 
-Each room draws its own results, in its `pictures.py`; here are what all pictures share and the face
-`ji.plot`, which finds them by the stub and imports a room's pictures when one is asked for.
+Each room draws its own results, in its `pictures.py`; here are what all pictures share
+and the face `ji.plot`, which finds them by the stub and imports a room's pictures when
+one is asked for.
 
 >>> import jimpact as ji
 >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})

@@ -1,4 +1,4 @@
-"""Public names of `ji.plot` and where they live: in the rooms whose results they draw."""
+"""Public names of `ji.plot` and the rooms in which they live."""
 
 from jimpact.fits.pictures import contour as contour, fit as fit
 from jimpact.fits.pictures_of_inference import (
@@ -21,7 +21,10 @@ from jimpact.methods.pictures_of_comparison import (
 from jimpact.montecarlo.pictures import monte_carlo as monte_carlo
 from jimpact.motion.films import animation as animation
 from jimpact.motion.pictures import motion as motion, phase_portrait as phase_portrait
-from jimpact.motion.pictures_of_systems import force_chains as force_chains, system as system
+from jimpact.motion.pictures_of_systems import (
+    force_chains as force_chains,
+    system as system,
+)
 from jimpact.plot.histories import (
     contact_loop as contact_loop,
     forces as forces,

@@ -1,4 +1,6 @@
-"""Pictures of contact forces and of force histories: of laws, on which pictures stand."""
+"""Pictures of contact forces and of force histories: of laws, on which pictures
+stand.
+"""
 
 from collections.abc import Mapping
 
@@ -6,7 +8,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jimpact.laws.histories import History
-from jimpact.plot.style import COLOURS, GREY, colour_of, legend_below, new_figure, styled, write
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    colour_of,
+    legend_below,
+    new_figure,
+    styled,
+    write,
+)
 from jimpact.tools.records import readable_unit
 
 
@@ -38,10 +48,10 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
 
 @styled(History)
 def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
-    """Force of one contact against its true approach; between the ends it encloses the lost energy.
+    """Force of a contact against its approach; the loop encloses the lost energy.
 
-    O begins, M1, M2, ... end compressions, R1, R2, ... are where a contact that expands is
-    compressed again, B is the end with the residual indentation.
+    O begins, M1, M2, ... end compressions, R1, R2, ... are where a contact that expands
+    is compressed again, B is the end with the residual indentation.
 
     Args:
         result: what `ji.history` returned, of one impact.
@@ -60,19 +70,28 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     ['O', 'M1', 'B']
     """
     _check_one(result)
-    force, rate = np.asarray(result.force[:, contact]), np.asarray(result.gap_velocity[:, contact])
+    force = np.asarray(result.force[:, contact])
+    rate = np.asarray(result.gap_velocity[:, contact])
     touching = np.flatnonzero(force > 0)
-    until = slice(0, touching[-1] + 2 if len(touching) else 1)  # to the first state without force
+    # to the first state without force
+    until = slice(0, touching[-1] + 2 if len(touching) else 1)
     unit, size = readable_unit("m", float(np.max(np.abs(result.approach[:, contact]))))
-    x, force = np.asarray(result.approach[until, contact]) / size, force[until]
+    x = np.asarray(result.approach[until, contact]) / size
+    force = force[until]
     figure, axes = new_figure(4.4, title)
     axes.plot(x, force, color=COLOURS[0], lw=1.8)
     axes.fill(x, force, color=COLOURS[4], alpha=0.2, lw=0)
     # states at which the gap velocity changes sign
-    turns = np.flatnonzero(np.diff(rate[until] > 0)) if len(touching) else np.zeros(0, int)
+    if len(touching):
+        turns = np.flatnonzero(np.diff(rate[until] > 0))
+    else:
+        turns = np.zeros(0, int)
     names = [f"{'MR'[i % 2]}{i // 2 + 1}" for i in range(len(turns))]
     for name, i in zip(["O", *names, "B"], [0, *turns, len(x) - 1], strict=True):
-        above = (0, -10) if name[0] == "R" else (0, 10)
+        if name[0] == "R":
+            above = (0, -10)
+        else:
+            above = (0, 10)
         axes.plot(x[i], force[i], "o", color="black", ms=4)
         write(axes, (x[i], force[i]), name, xytext=above, textcoords="offset points")
     axes.margins(y=0.12)
@@ -83,12 +102,14 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
 def _check_one(result: History) -> None:
     """Refuse batches of impacts."""
     if np.ndim(result.status):
-        raise ValueError("Argument `result` must be of one impact, but is a batch: pick one of it.")
+        raise ValueError(
+            "Argument `result` must be of one impact, but is a batch: pick one of it."
+        )
 
 
 @styled(History)
 def history(result: History, title: str = "") -> Figure:
-    """One impact over its time: forces, gap velocities and stored energy of every contact.
+    """One impact over its time: forces, gap velocities, stored energy.
 
     Args:
         result: what `ji.history` returned, of one impact.
@@ -107,7 +128,8 @@ def history(result: History, title: str = "") -> Figure:
     """
     _check_one(result)
     unit, size = readable_unit("s", float(result.duration))
-    time, contacts = np.asarray(result.time) / size, result.force.shape[1]
+    time = np.asarray(result.time) / size
+    contacts = result.force.shape[1]
     figure, panels = new_figure(6.8, title, 3, 1, sharex=True)
     rows = {
         "force [N]": result.force,
@@ -119,7 +141,9 @@ def history(result: History, title: str = "") -> Figure:
         axes.set_ylabel(label)
     for j, y in enumerate(np.asarray(result.tangential_force).T):
         colour = colour_of(j * contacts // result.tangential_force.shape[1])
-        panels[0].plot(time, y, "--", color=colour, label="tangential" if j == 0 else None)
+        panels[0].plot(
+            time, y, "--", color=colour, label="tangential" if j == 0 else None
+        )
     panels[1].axhline(0, color=GREY, lw=0.8)
     panels[-1].set_xlabel(f"impact time [{unit}]")
     legend_below(figure, 5, panels[0].get_legend_handles_labels()[0][: len(COLOURS)])

@@ -1,4 +1,6 @@
-"""Parts of all pictures: the style sheet, figures of panels, legends, logarithmic axes."""
+"""Parts of all pictures: the style sheet, figures of panels, legends, logarithmic
+axes.
+"""
 
 import functools
 import inspect
@@ -43,10 +45,11 @@ R = TypeVar("R")
 
 
 def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of a function that draws: its first argument must be a `kind`, else a TypeError.
+    """Decorator of a function that draws: its first argument must be a `kind`, else a
+    TypeError.
 
-    It draws in the style sheet, which leaves matplotlib's own settings as they were, and writes
-    minus signs in place of hyphens.
+    It draws in the style sheet, which leaves matplotlib's own settings as they were,
+    and writes minus signs in place of hyphens.
     """
 
     def decorated(picture: Callable[P, R]) -> Callable[P, R]:
@@ -82,7 +85,9 @@ def by_code(colours: tuple[str, ...]) -> dict[str, Any]:
 def new_figure(
     height: float, title: str = "", rows: int = 1, columns: int = 1, **grid: Any
 ) -> tuple[Figure, Any]:
-    """A figure of the common width, `height` [in] high, and its axes, see `Figure.subplots`."""
+    """A figure of the common width, `height` [in] high, and its axes, see
+    `Figure.subplots`.
+    """
     figure = Figure(figsize=(WIDTH, height))
     if title:
         figure.suptitle(title, x=0.01, ha="left")
@@ -95,7 +100,9 @@ def new_panels(
     """A figure of `count` panels, two side by side; a row is `height` [in] high."""
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
-    figure, panels = new_figure(more + height * rows, title, rows, columns, squeeze=False, **shared)
+    figure, panels = new_figure(
+        more + height * rows, title, rows, columns, squeeze=False, **shared
+    )
     for spare in panels.ravel()[count:]:
         spare.remove()
     return figure, panels.ravel()[:count]
@@ -107,12 +114,16 @@ Velocity = tuple[int, str, float]  # index, name, and what it is multiplied by
 def velocities_by_unit(scene: Scene, names: Sequence[str]) -> dict[str, list[Velocity]]:
     """Velocities of a scene grouped by unit; keys are the labels of their axes.
 
-    `names` are those of the n velocities, with units. Without names those of a chain are in m/s;
-    others, in m/s or rad/s, are comparable only times the root of their inertia M_ii, in √J.
+    `names` are those of the n velocities, with units. Without names those of a chain
+    are in m/s; others, in m/s or rad/s, are comparable only times the root of their
+    inertia M_ii, in √J.
     """
-    label, n = "velocity after the impact", scene.size
+    label = "velocity after the impact"
+    n = scene.size
     if names and len(names) != n:
-        raise ValueError(f"Argument `names` must have {n} names, one a velocity, but has {names}.")
+        raise ValueError(
+            f"Argument `names` must have {n} names, one a velocity, but has {names}."
+        )
     if not names and scene.walls is not None:
         return {f"{label} [m/s]": [(i, f"body {i + 1}", 1.0) for i in range(n)]}
     if not names:
@@ -121,17 +132,20 @@ def velocities_by_unit(scene: Scene, names: Sequence[str]) -> dict[str, list[Vel
         return {f"{label} · √inertia [√J]": each}
     by_unit: dict[str, list[Velocity]] = {}
     for i, (word, unit) in enumerate(map(split_name, names)):
-        by_unit.setdefault(f"{label} [{unit}]" if unit else label, []).append((i, word, 1.0))
+        by_unit.setdefault(f"{label} [{unit}]" if unit else label, []).append(
+            (i, word, 1.0)
+        )
     return by_unit
 
 
 def panels_of_laws(
     laws: Sequence[str], scene: Scene, names: Sequence[str], title: str, lowest: float
 ) -> tuple[Figure, list[tuple[Axes, list[Velocity]]], Axes]:
-    """Figure with laws side by side: a panel for the velocities of each unit, and one below.
+    """Figure with laws side by side: a panel for the velocities of each unit, and one
+    below.
 
-    Returns the figure, the upper panels with their velocities, and the lowest one, `lowest` [in]
-    high.
+    Returns the figure, the upper panels with their velocities, and the lowest one,
+    `lowest` [in] high.
     """
     units = velocities_by_unit(scene, names)
     heights = [2.6] * len(units) + [lowest]
@@ -143,7 +157,10 @@ def panels_of_laws(
         axes.grid(False, axis="x")
     many = len(laws) > _UPRIGHT
     laws = [law.replace("lzb", "LZB") for law in laws]
-    words = laws if many else [law.replace(", ", ",\n").replace("_", "\n") for law in laws]
+    if many:
+        words = laws
+    else:
+        words = [law.replace(", ", ",\n").replace("_", "\n") for law in laws]
     at = range(len(laws))
     panels[-1].set_xticks(at, words, fontsize=SMALL, rotation=90 if many else 0)
     panels[-1].set_xlabel("law")
@@ -151,7 +168,9 @@ def panels_of_laws(
 
 
 def side_by_side(bodies: int) -> np.ndarray:
-    """Offsets (bodies,) on the x axis of the bodies of one group: evenly over `SPREAD`, mean 0."""
+    """Offsets (bodies,) on the x axis of the bodies of one group: evenly over `SPREAD`,
+    mean 0.
+    """
     return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
 
 
@@ -163,12 +182,17 @@ def legend_below(
     It has the given `handles`, else those of all panels, each label once.
     """
     if handles is None:
-        pairs = [pair for x in figure.axes for pair in zip(*x.get_legend_handles_labels())]
+        pairs = [
+            pair for x in figure.axes for pair in zip(*x.get_legend_handles_labels())
+        ]
         first = {label: handle for handle, label in reversed(pairs)}
         handles = [first[label] for label in dict.fromkeys(label for _, label in pairs)]
     entries = list(handles)
     if entries:
-        place: Any = {"loc": "outside lower center", "ncols": min(columns, len(entries))}
+        place: Any = {
+            "loc": "outside lower center",
+            "ncols": min(columns, len(entries)),
+        }
         figure.legend(handles=entries, title=note or None, **place)
 
 
@@ -186,8 +210,13 @@ def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
 
     Call it when the panels have their final limits and scales.
     """
-    place: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": SMALL}
-    lowest_first, texts = sorted(ends, key=lambda end: end.at[1]), []
+    place: dict[str, Any] = {
+        "textcoords": "offset points",
+        "va": "center",
+        "fontsize": SMALL,
+    }
+    lowest_first = sorted(ends, key=lambda end: end.at[1])
+    texts = []
     for axes, at, name, colour in lowest_first:
         text = axes.annotate(name, at, xytext=(5, 0), color=colour, zorder=5, **place)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
@@ -195,7 +224,8 @@ def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
     figure.draw_without_rendering()  # the layout decides where points are on the page
     boxes: list[Bbox] = []
     for text in texts:
-        box, up = text.get_window_extent(), 0.0
+        box = text.get_window_extent()
+        up = 0.0
         while any(box.translated(0, up).overlaps(other) for other in boxes):
             up += box.height / 4
         text.xyann = (5, up * 72 / figure.dpi)
@@ -203,7 +233,8 @@ def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
 
 
 def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
-    """Draw outcome number i at a point (2,), hollow unless admissible; i < 0: a grey square.
+    """Draw outcome number i at a point (2,), hollow unless admissible; i < 0: a grey
+    square.
 
     Later ones are smaller, so that equal ones show.
     """
@@ -233,25 +264,38 @@ def logarithmic(axes: Axes, which: str) -> None:
         axis.set_major_locator(MaxNLocator(4))
     else:
         few = high / low < _DECADES
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: _tick(x, *axis.get_view_interval())))
+        axis.set_major_locator(
+            LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7)
+        )
+    axis.set_major_formatter(
+        FuncFormatter(lambda x, _: _tick(x, *axis.get_view_interval()))
+    )
     axis.set_minor_formatter(NullFormatter())
 
 
 def _tick(x: float, first: float, last: float) -> str:
-    """Label x of a logarithmic axis from `first` to `last`: a power of ten if one of these is."""
+    """Label x of a logarithmic axis from `first` to `last`: a power of ten if one of
+    these is.
+    """
     plain = all(_PLAIN[0] <= end < _PLAIN[1] for end in (first, last))
-    return in_words(x) if plain else as_power(x)
+    if plain:
+        return in_words(x)
+    return as_power(x)
 
 
 def in_words(x: float) -> str:
     """A number for an axis; powers of ten as such."""
-    return f"{x:g}" if x == 0 or _PLAIN[0] <= abs(x) < _PLAIN[1] else as_power(x)
+    if x == 0 or _PLAIN[0] <= abs(x) < _PLAIN[1]:
+        return f"{x:g}"
+    return as_power(x)
 
 
 def as_power(x: float) -> str:
     """A number as a factor, unless it is 1, and a power of ten."""
     power = int(np.floor(np.log10(abs(x)) + 1e-9))
     factor = x / 10.0**power
-    head = "" if abs(factor - 1) < 1e-6 else f"{factor:.3g}\\cdot"
+    if abs(factor - 1) < 1e-6:
+        head = ""
+    else:
+        head = f"{factor:.3g}\\cdot"
     return f"${head}10^{{{power}}}$"

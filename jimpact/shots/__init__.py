@@ -1,1 +1,3 @@
-"""Measured shots: velocities before and after impacts with their errors, and their files."""
+"""Measured shots: velocities before and after impacts with their errors, and their
+files.
+"""

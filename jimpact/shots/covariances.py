@@ -1,7 +1,8 @@
-"""Covariances of the velocities (v-, v+) of measured shots: one for each shot, or of all shots.
+"""Covariances of the velocities (v-, v+) of measured shots: one for each shot, or of
+all shots.
 
-Of each shot: (K, N, N) with N = 2n. Of all shots: (M, M) with M = N K, in the order v-, v+ of shot
-1, of shot 2, ...
+Of each shot: (K, N, N) with N = 2n. Of all shots: (M, M) with M = N K, in the order v-,
+v+ of shot 1, of shot 2, ...
 """
 
 from collections.abc import Sequence
@@ -13,9 +14,10 @@ from scipy.linalg import block_diag
 
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 
-# Share of a variance up to which an eigenvalue of a correlation is rounding, or two entries that
-# should be equal differ by it. Ten times more would pass shots whose v- and v+ are measured to 8
-# digits of each other; ten times less would refuse files of 10 digits.
+# Share of a variance up to which an eigenvalue of a correlation is rounding, or two
+# entries that should be equal differ by it. Ten times more would pass shots whose v-
+# and v+ are measured to 8 digits of each other; ten times less would refuse files of 10
+# digits.
 ROUNDING = 1e-10
 
 
@@ -24,8 +26,9 @@ def as_covariance(
 ) -> Float[np.ndarray, "K N N"] | Float[np.ndarray, "M M"]:
     """The checked covariance of the errors of (v-, v+) of K shots of n velocities.
 
-    It must be positive definite for each shot, but for v- of variance 0, which are exact. That of
-    all shots may be singular: without a force v+ of an impact is v- of the next.
+    It must be positive definite for each shot, but for v- of variance 0, which are
+    exact. That of all shots may be singular: without a force v+ of an impact is v- of
+    the next.
 
     Args:
         value: of each shot, or of all shots.
@@ -37,19 +40,24 @@ def as_covariance(
     check_concrete("covariance", value)
     as_float_array("covariance", value)  # raises for what are no numbers
     # in double precision, as errors of one impact may be nearly those of another
-    (count, n), array = shape, np.asarray(value, float)
-    of_each, of_all = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
+    count, n = shape
+    array = np.asarray(value, float)
+    of_each = (count, 2 * n, 2 * n)
+    of_all = (2 * n * count, 2 * n * count)
     if array.shape == of_each[1:] and count == 1:
         array = array[None]
     if array.shape not in (of_each, of_all):
         raise ValueError(
-            f"Argument `covariance` must have shape {of_each}, (v-, v+) of each shot, or {of_all}, "
+            f"Argument `covariance` must have shape {of_each}, (v-, v+) of each shot, "
+            f"or {of_all}, "
             f"of all shots, but has shape {array.shape}."
         )
     check_values("covariance", array)
     blocks = diagonal_blocks(array, 2 * n)
     for k, block in enumerate(blocks):
-        _check_positive(block, f" in shot {k + 1}", exact=np.arange(2 * n) < n, least=ROUNDING)
+        _check_positive(
+            block, f" in shot {k + 1}", exact=np.arange(2 * n) < n, least=ROUNDING
+        )
     if array.ndim == 2:
         exact = np.tile(np.arange(2 * n) < n, count)
         _check_positive(array, " of all shots", exact, least=-ROUNDING)
@@ -59,9 +67,13 @@ def as_covariance(
 
 
 def _check_positive(
-    matrix: Float[np.ndarray, "N N"], where: str, exact: Bool[np.ndarray, " N"], least: float
+    matrix: Float[np.ndarray, "N N"],
+    where: str,
+    exact: Bool[np.ndarray, " N"],
+    least: float,
 ) -> None:
-    """Raise a ValueError unless a covariance is symmetric and its correlation positive definite.
+    """Raise a ValueError unless a covariance is symmetric and its correlation positive
+    definite.
 
     Args:
         matrix: covariance.
@@ -81,23 +93,30 @@ def _check_positive(
     lowest = np.linalg.eigvalsh(matrix[block] / sizes[block])[0]
     if lowest < least:
         raise ValueError(
-            f"{must} positive definite, but its correlation has the eigenvalue {lowest:.3g}{where}."
+            f"{must} positive definite, but its correlation has the eigenvalue "
+            f"{lowest:.3g}{where}."
         )
 
 
 def diagonal_blocks(covariance: Any, size: int) -> Float[np.ndarray, "K N N"]:
-    """The covariance of each shot: as it is, or the diagonal blocks of that of all shots."""
+    """The covariance of each shot: as it is, or the diagonal blocks of that of all
+    shots.
+    """
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array
     count = len(array) // size
-    return array.reshape(count, size, count, size)[np.arange(count), :, np.arange(count)]
+    return array.reshape(count, size, count, size)[
+        np.arange(count), :, np.arange(count)
+    ]
 
 
 def covariance_of(
     covariance: Any, shots: Int[np.ndarray, " S"], n: int
 ) -> Float[np.ndarray, "S N N"] | Float[np.ndarray, "M M"]:
-    """Covariance of (v-, v+) of some shots (indices from 0) of n velocities, in the same form."""
+    """Covariance of (v-, v+) of some shots (indices from 0) of n velocities, in the
+    same form.
+    """
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array[shots]
@@ -106,7 +125,9 @@ def covariance_of(
 
 
 def joined_covariance(many: Sequence[Any]) -> np.ndarray:
-    """Covariance of the shots of several sets, one after the other, with independent errors."""
+    """Covariance of the shots of several sets, one after the other, with independent
+    errors.
+    """
     if all(each.ndim == 3 for each in many):
         return np.concatenate(many)
     return block_diag(*(block_diag(*each) if each.ndim == 3 else each for each in many))
@@ -115,7 +136,9 @@ def joined_covariance(many: Sequence[Any]) -> np.ndarray:
 def moved_covariance(
     covariance: Any, gain: Float[np.ndarray, "K m N"]
 ) -> Float[np.ndarray, "K m m"] | Float[np.ndarray, "K m K m"]:
-    """The covariance `G C G^T` of values `G (v-, v+)` of each shot, or of all, G the gain."""
+    """The covariance `G C G^T` of values `G (v-, v+)` of each shot, or of all, G the
+    gain.
+    """
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return gain @ array @ gain.swapaxes(1, 2)
@@ -127,10 +150,13 @@ def moved_covariance(
 def whitening(
     covariance: Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"],
     used: Bool[np.ndarray, "K n"],
-) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]]:
+) -> tuple[
+    Float[np.ndarray, "K n"], Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]
+]:
     """Standard errors of values, and the whitening matrices of their errors.
 
-    Equation: `L = F^-1`, F the Cholesky factor of the correlation: `L e / sigma` are independent.
+    Equation: `L = F^-1`, F the Cholesky factor of the correlation: `L e / sigma` are
+    independent.
 
     Args:
         covariance: of the values of each shot, or of all.
@@ -142,16 +168,23 @@ def whitening(
     Raises:
         ValueError: a combination of the values has no error.
     """
-    rows = used if covariance.ndim == 3 else used.reshape(1, -1)
+    if covariance.ndim == 3:
+        rows = used
+    else:
+        rows = used.reshape(1, -1)
     size = rows.shape[1]  # of one matrix for each shot, or of one for all
     matrices = covariance.reshape(-1, size, size)
     matrices = np.where(rows[:, :, None] & rows[:, None, :], matrices, np.eye(size))
     errors = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
     try:
-        factor = np.linalg.cholesky(matrices / (errors[:, :, None] * errors[:, None, :]))
+        factor = np.linalg.cholesky(
+            matrices / (errors[:, :, None] * errors[:, None, :])
+        )
     except np.linalg.LinAlgError:
         raise ValueError(
-            "Argument `covariance` must leave an error in each velocity after an impact that the "
-            "law predicts from those before, but is singular there: are shots in it twice?"
+            "Argument `covariance` must leave an error in each velocity after an "
+            "impact that the "
+            "law predicts from those before, but is singular there: are shots in it "
+            "twice?"
         ) from None
     return errors.reshape(used.shape), np.linalg.inv(factor).reshape(covariance.shape)

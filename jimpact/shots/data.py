@@ -30,8 +30,9 @@ from jimpact.tools.checks import (
 )
 from jimpact.tools.records import counted
 
-# Share of velocities, momenta and readings up to which a difference is rounding, also in files of
-# ten digits. Ten times more would take measured shots for corrected ones no more often.
+# Share of velocities, momenta and readings up to which a difference is rounding, also
+# in files of ten digits. Ten times more would take measured shots for corrected ones no
+# more often.
 ROUNDING = 1e-9
 _VELOCITY = ("velocity", "velocities")
 _PRINTED = 4  # shots that `print` shows
@@ -44,28 +45,33 @@ class Experiments(eqx.Module):
     Args:
         pre: v- (K, n), or (n,) for one shot [m/s].
         post: v+ of the same shape [m/s]; NaN marks a value that was not measured.
-        sigma: standard error of each `post` value, (K, n) or a scalar, > 0 [m/s]; None: unknown,
-            then `fit` estimates one common noise from the residual.
-        scenes: one `Scene` for each shot, with the same coordinates, but any number of contacts; a
-            law's entry j belongs to contact j of each. None: the argument `scene` of `fit`.
+        sigma: standard error of each `post` value, (K, n) or a scalar, > 0 [m/s]; None:
+            unknown, then `fit` estimates one common noise from the residual.
+        scenes: one `Scene` for each shot, with the same coordinates, but any number of
+            contacts; a law's entry j belongs to contact j of each. None: the argument
+            `scene` of `fit`.
         shots: K labels for tables and pictures; None: 1, 2, ...
-        lost_freedom: independent values that a correction has removed from each shot, K numbers or
-            one for all.
-        units: of each velocity, n times 'm/s' or 'rad/s', or one for all; None: m/s. Without sigma,
-            velocities of different units weigh as much as others of the same kinetic energy.
-        sigma_pre: standard error of each `pre` value, (K, n) or a scalar, >= 0 [m/s]; with it goes
-            a `sigma`, or a `resolution`. `fit` passes it on to v+, see `FitProblem`.
-        resolution: steps in which `post` was read, (K, n) or a scalar, > 0 [m/s]: readings rounded
-            to q have the standard error q / sqrt(12), which is added to sigma (in squares).
-        covariance: of the errors of (v-, v+), instead of sigma, sigma_pre and resolution: one for
-            each shot, (K, 2n, 2n), or of all shots, (2nK, 2nK), where they share errors, as
-            successive impacts share a flight. The fields `sigma` and `sigma_pre` are then the roots
-            of its diagonal.
+        lost_freedom: independent values that a correction has removed from each shot, K
+            numbers or one for all.
+        units: of each velocity, n times 'm/s' or 'rad/s', or one for all; None: m/s.
+            Without sigma, velocities of different units weigh as much as others of the
+            same kinetic energy.
+        sigma_pre: standard error of each `pre` value, (K, n) or a scalar, >= 0 [m/s];
+            with it goes a `sigma`, or a `resolution`. `fit` passes it on to v+, see
+            `FitProblem`.
+        resolution: steps in which `post` was read, (K, n) or a scalar, > 0 [m/s]:
+            readings rounded to q have the standard error q / sqrt(12), which is added
+            to sigma (in squares).
+        covariance: of the errors of (v-, v+), instead of sigma, sigma_pre and
+            resolution: one for each shot, (K, 2n, 2n), or of all shots, (2nK, 2nK),
+            where they share errors, as successive impacts share a flight. The fields
+            `sigma` and `sigma_pre` are then the roots of its diagonal.
 
     Raises:
-        ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, no value
-            measured, scenes that do not belong to these velocities; a covariance beside sigma, of
-            another shape, not finite, not symmetric or not positive definite for each shot.
+        ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <=
+            0, no value measured, scenes that do not belong to these velocities; a
+            covariance beside sigma, of another shape, not finite, not symmetric or not
+            positive definite for each shot.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.26, 0.73], sigma=0.01)
@@ -97,8 +103,11 @@ class Experiments(eqx.Module):
         resolution: Any = None,
         covariance: Any = None,
     ):
-        """Check and convert the arguments; resolution and covariance determine sigma."""
-        self.pre, self.post = _as_rows("pre", pre), _as_rows("post", post)
+        """Check and convert the arguments; resolution and covariance determine
+        sigma.
+        """
+        self.pre = _as_rows("pre", pre)
+        self.post = _as_rows("post", post)
         if self.pre.shape != self.post.shape:
             raise ValueError(
                 "Arguments `pre` and `post` must have the same shape, "
@@ -108,7 +117,9 @@ class Experiments(eqx.Module):
         check_values("post", self.post, nan_allowed=True)
         measured = ~np.isnan(np.asarray(self.post))
         if not measured.any():
-            raise ValueError("Argument `post` must hold a measured value, but all are missing.")
+            raise ValueError(
+                "Argument `post` must hold a measured value, but all are missing."
+            )
         self.covariance = None
         if covariance is not None:
             others = {"sigma": sigma, "sigma_pre": sigma_pre, "resolution": resolution}
@@ -122,14 +133,23 @@ class Experiments(eqx.Module):
         self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, zero=True)
         if self.resolution is not None:
             rounding = self.resolution / np.sqrt(12)
-            self.sigma = rounding if self.sigma is None else jnp.hypot(self.sigma, rounding)
+            if self.sigma is None:
+                self.sigma = rounding
+            else:
+                self.sigma = jnp.hypot(self.sigma, rounding)
         if self.sigma_pre is not None and self.sigma is None:
             raise ValueError(
-                "Argument `sigma` must be given where `sigma_pre` is, but is None: the errors "
+                "Argument `sigma` must be given where `sigma_pre` is, but is None: the "
+                "errors "
                 "before and after the impact weigh against each other."
             )
-        self.scenes = None if scenes is None else _as_scenes(scenes, self.pre.shape)
-        self.shots = tuple(map(str, range(1, len(measured) + 1) if shots is None else shots))
+        if scenes is None:
+            self.scenes = None
+        else:
+            self.scenes = _as_scenes(scenes, self.pre.shape)
+        self.shots = tuple(
+            map(str, range(1, len(measured) + 1) if shots is None else shots)
+        )
         if len(self.shots) != len(measured):
             raise ValueError(
                 f"Argument `shots` must have {len(measured)} labels, one per shot, "
@@ -137,26 +157,41 @@ class Experiments(eqx.Module):
             )
         self.lost = tuple(np.broadcast_to(lost_freedom, len(measured)).tolist())
         n = measured.shape[1]
-        units = LINEAR if units is None else units
-        self.units = (units,) * n if isinstance(units, str) else tuple(units)
+        if units is None:
+            units = LINEAR
+        if isinstance(units, str):
+            self.units = (units,) * n
+        else:
+            self.units = tuple(units)
         if len(self.units) != n or not set(self.units) <= {LINEAR, ANGULAR}:
             raise ValueError(
-                f"Argument `units` must have {n} entries, each '{LINEAR}' or '{ANGULAR}', "
-                f"but has value {units!r}: convert velocities to these (1 cm/s = 0.01 m/s)."
+                f"Argument `units` must have {n} entries, each '{LINEAR}' or "
+                f"'{ANGULAR}', "
+                f"but has value {units!r}: convert velocities to these (1 cm/s = 0.01 "
+                f"m/s)."
             )
 
     def __str__(self) -> str:
-        """Number of shots, units, missing values, the range of sigma, and the first shots."""
+        """Number of shots, units, missing values, the range of sigma, and the first
+        shots.
+        """
         count, n = self.pre.shape
-        missing, sigma = int((~self.measured).sum()), self.sigma
+        missing = int((~self.measured).sum())
+        sigma = self.sigma
         units = ", ".join(dict.fromkeys(self.units))
         lines = [f"{counted(count, 'shot')} of {counted(n, *_VELOCITY)} [{units}]"]
         if missing:
-            was = "was" if missing == 1 else "were"
-            lines.append(f"{missing} of {self.post.size} velocities after {was} not measured")
-        known = (
-            "not known" if sigma is None else f"{np.nanmin(sigma):.3g} to {np.nanmax(sigma):.3g}"
-        )
+            if missing == 1:
+                was = "was"
+            else:
+                was = "were"
+            lines.append(
+                f"{missing} of {self.post.size} velocities after {was} not measured"
+            )
+        if sigma is None:
+            known = "not known"
+        else:
+            known = f"{np.nanmin(sigma):.3g} to {np.nanmax(sigma):.3g}"
         lines.append(f"sigma    {known}")
         for label, before, after in zip(self.shots[:_PRINTED], self.pre, self.post):
             lines.append(f"shot {label}: {in_numbers(before)} -> {in_numbers(after)}")
@@ -182,19 +217,26 @@ class Experiments(eqx.Module):
         return ~np.isnan(np.asarray(self.post))
 
     def scene_of(self, scene: Scene | None, shot: int) -> Scene:
-        """The scene of one shot (counted from 0): its own, or else the given common one."""
+        """The scene of one shot (counted from 0): its own, or else the given common
+        one.
+        """
         return self.each(scene, lambda each: each)[shot]
 
     def largest_scene(self, scene: Scene | None) -> Scene:
-        """The first of the scenes (or the given common scene) with the most contacts."""
+        """The first of the scenes (or the given common scene) with the most
+        contacts.
+        """
         return max(self.each(scene, lambda each: each), key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
-        """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
+        """Momentum that the contacts cannot have changed, but the data did: (K, c) [N
+        s].
 
-        Equation: `C^T M (v+ - v-)`, columns of C spanning the complement of range(N), each
-        scaled to a largest entry of 1. A chain without walls has c = 1, C = (1, ..., 1): its
-        total momentum. NaN for shots with missing values. `scene`: where shots carry none.
+        Equation: `C^T M (v+ - v-)`, columns of C spanning the complement of range(N),
+        each
+        scaled to a largest entry of 1. A chain without walls has c = 1, C = (1, ...,
+        1): its total momentum. NaN for shots with missing values. `scene`: where shots
+        carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -204,28 +246,40 @@ class Experiments(eqx.Module):
         return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """`C^T M v+ / C^T M v-` (K, c) in a scene, see `momentum_excess`; inf or NaN over 0."""
+        """`C^T M v+ / C^T M v-` (K, c) in a scene, see `momentum_excess`; inf or NaN
+        over 0.
+        """
         rows = []
         with np.errstate(divide="ignore", invalid="ignore"):
             for m, pre, post in self.balances(scene):
-                before, rounding = m @ pre, 1e-12 * np.abs(m) @ np.abs(pre)
-                rows.append((m @ post) / np.where(np.abs(before) > rounding, before, 0.0))
+                before = m @ pre
+                rounding = 1e-12 * np.abs(m) @ np.abs(pre)
+                rows.append(
+                    (m @ post) / np.where(np.abs(before) > rounding, before, 0.0)
+                )
         return _filled(rows)
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """`T+ / T-` of every shot (K,) in a scene; NaN for shots with missing values."""
-        masses, both = np.array(self.each(scene, dense_mass)), (self.pre, self.post)
-        before, after = (np.einsum("ki,kij,kj->k", v, masses, v) for v in map(np.asarray, both))
+        """`T+ / T-` of every shot (K,) in a scene; NaN for shots with missing
+        values.
+        """
+        masses = np.array(self.each(scene, dense_mass))
+        both = (self.pre, self.post)
+        before, after = (
+            np.einsum("ki,kij,kj->k", v, masses, v) for v in map(np.asarray, both)
+        )
         return after / np.where(before > 0, before, np.nan)
 
     def momentum_corrected(self, scene: Scene | None = None) -> "Experiments":
         """The same shots, moved as little as possible so that they conserve momentum.
 
-        Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
-        (sigma = 1 where unknown; with a `covariance` by that of v+). For equal masses in a chain:
-        the mean excess is taken from each component. Shots with missing values stay as they are.
-        v- stay as they were measured; where they have a `sigma_pre`, `fit` passes it on through the
-        correction. `scene`: where shots carry none.
+        Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to
+        `C^T M (v+' - v-) = 0`
+        (sigma = 1 where unknown; with a `covariance` by that of v+). For equal masses
+        in a chain: the mean excess is taken from each component. Shots with missing
+        values stay as they are. v- stay as they were measured; where they have a
+        `sigma_pre`, `fit` passes it on through the correction. `scene`: where shots
+        carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -233,7 +287,9 @@ class Experiments(eqx.Module):
         >>> [round(float(v), 6) for v in corrected.post[0]]
         [0.15, 0.85]
         """
-        corrected, lost, after = np.array(self.post, dtype=float), list(self.lost), _after(self)
+        corrected = np.array(self.post, dtype=float)
+        lost = list(self.lost)
+        after = _after(self)
         for k, (m, pre, post) in enumerate(self.balances(scene)):
             if len(m) == 0 or np.isnan(post).any():
                 continue
@@ -252,10 +308,14 @@ class Experiments(eqx.Module):
             return copy
         # set afterwards: sigma has the error of rounding already
         steps = np.asarray(resolution)
-        return eqx.tree_at(lambda x: x.resolution, copy, steps, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            lambda x: x.resolution, copy, steps, is_leaf=lambda x: x is None
+        )
 
     def _of_each_shot(self) -> dict[str, Any]:
-        """Arguments with one entry for each shot, by name; None where the shots have none."""
+        """Arguments with one entry for each shot, by name; None where the shots have
+        none.
+        """
         values = {name: getattr(self, name) for name in _VALUES}
         fields: dict[str, Any] = {
             name: None if x is None else np.asarray(x) for name, x in values.items()
@@ -268,7 +328,9 @@ class Experiments(eqx.Module):
         chosen = np.isin(self.contacts, contacts)
         if not chosen.any():
             numbers = ", ".join(map(str, sorted(set(self.contacts))))
-            raise ValueError(f"`contacts` in [data] must be one of {numbers}, but is {contacts}.")
+            raise ValueError(
+                f"`contacts` in [data] must be one of {numbers}, but is {contacts}."
+            )
         return self.only(chosen)
 
     def only(self, which: Any) -> "Experiments":
@@ -298,24 +360,33 @@ class Experiments(eqx.Module):
         """All shots of several data sets in one; `a + b` joins two.
 
         Args:
-            many: sets of the same bodies. All or none of them have a `sigma`, and scenes of their
-                own. v- without a `sigma_pre` count as exact where others have one. Labels that
-                several sets have get the number of their set: 2/1 is shot 1 of the second.
+            many: sets of the same bodies. All or none of them have a `sigma`, and
+                scenes of their own. v- without a `sigma_pre` count as exact where
+                others have one. Labels that several sets have get the number of their
+                set: 2/1 is shot 1 of the second.
 
         Raises:
-            ValueError: no sets; other numbers of bodies, units, sigma or scenes in some.
+            ValueError: no sets; other numbers of bodies, units, sigma or scenes in
+                some.
 
         >>> import jimpact as ji
-        >>> first, second = (ji.Experiments([v, 0.0], [0.1 * v, 0.9 * v]) for v in (1.0, 2.0))
+        >>> first, second = (
+        ...     ji.Experiments([v, 0.0], [0.1 * v, 0.9 * v]) for v in (1.0, 2.0)
+        ... )
         >>> (first + second).shots, (first + second).pre.tolist()
         (('1/1', '2/1'), [[1.0, 0.0], [2.0, 0.0]])
         """
         many = list(many)
         if not many:
-            raise ValueError("Argument `many` must hold at least one data set, but is empty.")
+            raise ValueError(
+                "Argument `many` must hold at least one data set, but is empty."
+            )
         for name, same in (
             ("as many bodies and the same units", [data.units for data in many]),
-            ("a `sigma` (or `resolution`) in all or in none", [d.sigma is None for d in many]),
+            (
+                "a `sigma` (or `resolution`) in all or in none",
+                [d.sigma is None for d in many],
+            ),
             ("scenes of their own in all or in none", [d.scenes is None for d in many]),
         ):
             if len(set(same)) > 1:
@@ -332,23 +403,33 @@ class Experiments(eqx.Module):
         for name in columns[0]:
             parts = [each[name] for each in columns]
             all_have_it = all(part is not None for part in parts)
-            joined[name] = [row for part in parts for row in part] if all_have_it else None
+            if all_have_it:
+                joined[name] = [row for part in parts for row in part]
+            else:
+                joined[name] = None
         if len(set(joined["shots"])) < len(joined["shots"]):
             sets = enumerate(many, 1)
-            joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]
+            joined["shots"] = [
+                f"{i}/{label}" for i, data in sets for label in data.shots
+            ]
         return many[0]._with(**joined)
 
     @property
     def joint(self) -> np.ndarray | None:
-        """Covariance of (v-, v+): (K, 2n, 2n), or (2nK, 2nK) of all shots; None: not known.
+        """Covariance of (v-, v+): (K, 2n, 2n), or (2nK, 2nK) of all shots; None: not
+        known.
 
-        By `covariance`, or else by `sigma` and `sigma_pre` (0 where it is None) as independent
-        errors. Of a value that was not measured the variance of `sigma` is 1.
+        By `covariance`, or else by `sigma` and `sigma_pre` (0 where it is None) as
+        independent errors. Of a value that was not measured the variance of `sigma` is
+        1.
         """
         if self.covariance is not None or self.sigma is None:
             return self.covariance
         after = np.where(self.measured, np.asarray(self.sigma, float), 1.0)
-        before = np.zeros_like(after) if self.sigma_pre is None else np.asarray(self.sigma_pre)
+        if self.sigma_pre is None:
+            before = np.zeros_like(after)
+        else:
+            before = np.asarray(self.sigma_pre)
         errors = np.hstack([before, after])
         return errors[:, :, None] ** 2 * np.eye(errors.shape[1])
 
@@ -358,7 +439,8 @@ class Experiments(eqx.Module):
         return np.array(self.each(None, lambda scene: scene.contacts))
 
     def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
-        """Largest approach speed `max(0, -N^T v-)` (K,) of closed contacts of the scene [m/s].
+        """Largest approach speed `max(0, -N^T v-)` (K,) of closed contacts of the scene
+        [m/s].
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])
@@ -370,34 +452,52 @@ class Experiments(eqx.Module):
         return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """Errors (n,) of equal weight in a scene: 1 m/s, and those rad/s of as much energy.
+        """Errors (n,) of equal weight in a scene: 1 m/s, and those rad/s of as much
+        energy.
 
-        Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
+        Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in
+        rad/s)`.
         """
         turns = np.array(self.units) == ANGULAR
         if turns.all() or not turns.any():
             return np.ones(len(turns))
-        masses = np.mean([np.diag(mass) for mass in self.each(scene, dense_mass)], axis=0)
-        return np.where(turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0)
+        masses = np.mean(
+            [np.diag(mass) for mass in self.each(scene, dense_mass)], axis=0
+        )
+        return np.where(
+            turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0
+        )
 
-    def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """`C^T M` (c, n) of `momentum_excess`, v- (n,) and v+ (n,) of each shot in its scene."""
-        pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
-        return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
+    def balances(
+        self, scene: Scene | None
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """`C^T M` (c, n) of `momentum_excess`, v- (n,) and v+ (n,) of each shot in its
+        scene.
+        """
+        pre = np.asarray(self.pre, float)
+        post = np.asarray(self.post, float)
+        return [
+            (rows, a, b)
+            for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)
+        ]
 
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
-        """K values `function(scene)` of the scenes of the shots; once for a scene they share."""
+        """K values `function(scene)` of the scenes of the shots; once for a scene they
+        share.
+        """
         if self.scenes is not None:
             different = {id(each): each for each in self.scenes}
             values = {key: function(each) for key, each in different.items()}
             return [values[id(each)] for each in self.scenes]
         if scene is None:
             raise ValueError(
-                "Argument `scene` must be a Scene where the experiments carry none, but is None."
+                "Argument `scene` must be a Scene where the experiments carry none, "
+                "but is None."
             )
         if scene.size != self.pre.shape[1]:
             raise ValueError(
-                "Argument `experiments` must have one velocity per body of the scene: it has "
+                "Argument `experiments` must have one velocity per body of the scene: "
+                "it has "
                 f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
             )
         return [function(scene)] * len(self.shots)
@@ -405,7 +505,8 @@ class Experiments(eqx.Module):
 
 def _after(data: Experiments) -> np.ndarray:
     """Covariance (K, n, n) of v+ of each shot; the identity where no error is known."""
-    (count, n), joint = data.pre.shape, data.joint
+    count, n = data.pre.shape
+    joint = data.joint
     if joint is None:
         return np.tile(np.eye(n), (count, 1, 1))
     return diagonal_blocks(joint, 2 * n)[:, n:, n:]
@@ -414,18 +515,21 @@ def _after(data: Experiments) -> np.ndarray:
 def _smallest_change(after: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """`S m^T (m S m^T)^-1` (n, c), S = `after` (n, n), m = `rows` = C^T M (c, n).
 
-    Its columns are the changes of v+, least in the norm of S^-1, by one unit of each momentum.
+    Its columns are the changes of v+, least in the norm of S^-1, by one unit of each
+    momentum.
     """
     weighted = after @ rows.T
     return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
 
 
 def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
-    """Projectors (K, n, n) of the momentum corrections of shots; identities where there was none.
+    """Projectors (K, n, n) of the momentum corrections of shots; identities where there
+    was none.
 
     Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S the covariance of v+.
     """
-    kept, after = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1)), _after(data)
+    kept = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1))
+    after = _after(data)
     for k, (m, pre, post) in enumerate(data.balances(scene)):
         rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
         if 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all():
@@ -440,7 +544,8 @@ def _filled(rows: list[np.ndarray]) -> np.ndarray:
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:
-    """`C^T M` (c, n): C spans the orthogonal complement of all normals, tangents, constraints.
+    """`C^T M` (c, n): C spans the orthogonal complement of all normals, tangents,
+    constraints.
 
     Each column of C is scaled to a largest entry of 1.
     """
@@ -450,7 +555,9 @@ def conserved_momenta(scene: Scene) -> np.ndarray:
     rank = int((singular > singular[0] * max(forces.shape) * np.finfo(float).eps).sum())
     complement = u[:, rank:]
     largest = np.argmax(np.abs(complement).round(12), axis=0)  # the first of equal ones
-    return (complement / complement[largest, np.arange(complement.shape[1])]).T @ dense_mass(scene)
+    return (
+        complement / complement[largest, np.arange(complement.shape[1])]
+    ).T @ dense_mass(scene)
 
 
 def closed_normals(scene: Scene) -> np.ndarray:
@@ -469,7 +576,8 @@ def _check_alone(given: str, others: dict[str, Any]) -> None:
     for name, beside in others.items():
         if beside is not None:
             raise ValueError(
-                f"Argument `{name}` must be left out where `{given}` is given, which holds all "
+                f"Argument `{name}` must be left out where `{given}` is given, which "
+                f"holds all "
                 "errors, but both are given."
             )
 
@@ -478,7 +586,8 @@ def _as_rows(name: str, value: Any) -> jax.Array:
     """Velocities as an array (K, n), of one shot (1, n)."""
     array = as_float_array(name, value)
     check_concrete(name, array)
-    array = array[None, :] if array.ndim == 1 else array
+    if array.ndim == 1:
+        array = array[None, :]
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
             f"Argument `{name}` must have shape (K, n), K >= 1 shots of n velocities, "
@@ -487,8 +596,12 @@ def _as_rows(name: str, value: Any) -> jax.Array:
     return array
 
 
-def _as_sigma(name: str, value: Any, measured: np.ndarray, zero: bool = False) -> jax.Array | None:
-    """Standard errors as (K, n), NaN where no value was measured; `zero`: 0 is allowed."""
+def _as_sigma(
+    name: str, value: Any, measured: np.ndarray, zero: bool = False
+) -> jax.Array | None:
+    """Standard errors as (K, n), NaN where no value was measured; `zero`: 0 is
+    allowed.
+    """
     if value is None:
         return None
     sigma = as_float_array(name, value)
@@ -497,11 +610,14 @@ def _as_sigma(name: str, value: Any, measured: np.ndarray, zero: bool = False) -
         sigma = sigma[None, :]
     if sigma.shape not in ((), measured.shape):
         raise ValueError(
-            f"Argument `{name}` must be a scalar or have shape {measured.shape} like `post`, "
+            f"Argument `{name}` must be a scalar or have shape {measured.shape} like "
+            f"`post`, "
             f"but has shape {tuple(sigma.shape)}."
         )
     # the error of a value that was not measured does not matter
-    check_values(name, np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=not zero)
+    check_values(
+        name, np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=not zero
+    )
     return jnp.where(measured, sigma, jnp.nan)
 
 
@@ -511,12 +627,14 @@ def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, 
     scenes = tuple(scenes)
     if len(scenes) != shape[0]:
         raise ValueError(
-            f"Argument `scenes` must have one scene per shot, {shape[0]}, but has {len(scenes)}."
+            f"Argument `scenes` must have one scene per shot, {shape[0]}, but has "
+            f"{len(scenes)}."
         )
     for k, scene in enumerate(scenes):
         if scene.size != shape[1]:
             raise ValueError(
-                f"Argument `scenes` must have {shape[1]} bodies as the velocities have, "
+                f"Argument `scenes` must have {shape[1]} bodies as the velocities "
+                f"have, "
                 f"but the scene of shot {k + 1} has {scene.size}."
             )
     stackable(scenes)  # raises where they cannot be fitted together
@@ -528,29 +646,32 @@ def read_experiments(
 ) -> Experiments:
     """Read shots from a CSV file whose headers state the units.
 
-    Columns: `pre_1[m/s]`, `post_1[m/s]` and so on for every body, optional `sigma_1[m/s]`, ...
-    (standard errors of `post`), `sigma_pre_1[m/s]` (of `pre`), `resolution_1[m/s]` (steps of the
-    readings, see `Experiments`) and `shot` (a label); `comment` and `comment_...` are not read.
-    Units: m/s, cm/s, mm/s, km/h, in/s, ft/s, converted to m/s; rad/s, deg/s, converted to rad/s. An
-    empty `post` cell is a value that was not measured; so is NaN, with a warning. Scenes that
-    differ from shot to shot: `mass_1[kg]` (kg, g) of every body and `gap_1[m]` (m, cm, mm, um) of
-    every contact of a chain; `q_1[m]`, `q_2[rad]`, ... (lengths, rad, deg, 1) are the configuration
-    of a body.
+    Columns: `pre_1[m/s]`, `post_1[m/s]` and so on for every body, optional
+    `sigma_1[m/s]`, ... (standard errors of `post`), `sigma_pre_1[m/s]` (of `pre`),
+    `resolution_1[m/s]` (steps of the readings, see `Experiments`) and `shot` (a label);
+    `comment` and `comment_...` are not read.
+    Units: m/s, cm/s, mm/s, km/h, in/s, ft/s, converted to m/s; rad/s, deg/s, converted
+    to rad/s. An empty `post` cell is a value that was not measured; so is NaN, with a
+    warning. Scenes that differ from shot to shot: `mass_1[kg]` (kg, g) of every body
+    and `gap_1[m]` (m, cm, mm, um) of every contact of a chain; `q_1[m]`, `q_2[rad]`,
+    ... (lengths, rad, deg, 1) are the configuration of a body.
 
     Args:
         path: of the file.
-        scene: what such columns complete: a chain, whose masses or gaps they take the place of, or
-            a `Body`, which they place. The shots then have scenes of their own.
-        near: of a body's contacts, those up to so far above the lowest one are closed, the others
-            are left out (see `Body.scenes`) [m].
+        scene: what such columns complete: a chain, whose masses or gaps they take the
+            place of, or a `Body`, which they place. The shots then have scenes of their
+            own.
+        near: of a body's contacts, those up to so far above the lowest one are closed,
+            the others are left out (see `Body.scenes`) [m].
 
     Returns:
         `Experiments` of K shots, all in m/s and rad/s.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: unknown or missing unit, missing, unknown or repeated column, text in a
-            number, a line of the wrong length, no shots, sigma <= 0; with file, line and column.
+        ValueError: unknown or missing unit, missing, unknown or repeated column, text
+            in a number, a line of the wrong length, no shots, sigma <= 0; with file,
+            line and column.
 
     >>> import jimpact as ji
     >>> from importlib.resources import files
@@ -560,8 +681,10 @@ def read_experiments(
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(
-            f"Argument `path` must be the path of a CSV file, but is {short_repr(path)}. Of arrays "
-            "or a table in memory make `Experiments(pre=table[[...]], post=table[[...]])`."
+            f"Argument `path` must be the path of a CSV file, but is "
+            f"{short_repr(path)}. Of arrays "
+            "or a table in memory make `Experiments(pre=table[[...]], "
+            "post=table[[...]])`."
         )
     values, units, shots = read_shots(path)
     named: dict[str, Any] = {name: values.get(name) for name in _VALUES}
@@ -570,9 +693,13 @@ def read_experiments(
 
 
 def _scenes_of(
-    path: str | Path, values: dict[str, np.ndarray], place: Scene | Body | None, near: float
+    path: str | Path,
+    values: dict[str, np.ndarray],
+    place: Scene | Body | None,
+    near: float,
 ) -> list[Scene] | None:
-    """Scenes of the shots by the columns q, mass, gap of a file; None without such columns.
+    """Scenes of the shots by the columns q, mass, gap of a file; None without such
+    columns.
 
     `place` is the `Body` that q places, or the chain whose masses or gaps are replaced.
     """
@@ -581,14 +708,18 @@ def _scenes_of(
         return None
     if "q" in values:
         if columns != ["q"] or not isinstance(place, Body):
+            if columns != ["q"]:
+                given = "with masses or gaps"
+            else:
+                given = f"for {type(place).__name__}"
             raise ValueError(
-                f"{path}: columns `q` must belong to a body, but are given "
-                f"{'with masses or gaps' if columns != ['q'] else f'for {type(place).__name__}'}."
+                f"{path}: columns `q` must belong to a body, but are given {given}."
             )
         return place.scenes(values["q"], near)
     if not isinstance(place, Scene) or ("mass" in values and place.walls is None):
         raise ValueError(
-            f"{path}: columns `{columns[0]}` must belong to a chain that is given as `scene`, but "
+            f"{path}: columns `{columns[0]}` must belong to a chain that is given as "
+            f"`scene`, but "
             f"that is {type(place).__name__}."
         )
     count = len(values["pre"])

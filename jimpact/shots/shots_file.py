@@ -1,4 +1,6 @@
-"""Shots and motions in CSV files whose columns carry units; read and checked without JAX."""
+"""Shots and motions in CSV files whose columns carry units; read and checked without
+JAX.
+"""
 
 import csv
 import re
@@ -18,7 +20,9 @@ UNITS = {  # of velocities, in m/s or rad/s
     "rad/s": 1.0,
     "deg/s": np.pi / 180,
 }
-LINEAR, ANGULAR = "m/s", "rad/s"  # the units after reading
+# the units after reading
+LINEAR = "m/s"
+ANGULAR = "rad/s"
 _LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}  # [m], by unit
 _ANGLES = {"rad": 1.0, "deg": np.pi / 180}  # [rad], by unit
 _KINDS = {  # of columns, with their units
@@ -30,22 +34,31 @@ _KINDS = {  # of columns, with their units
 _NEEDED = ("pre", "post")
 # Standard errors, and the kinds of column whose errors they are.
 _ERRORS = {"sigma": "post", "sigma_pre": "pre", "resolution": "post", "sigma_q": "q"}
-_OF_MOTIONS = {"t": {"s": 1.0, "ms": 0.001}, **dict.fromkeys(("q", "sigma_q"), _KINDS["q"])}
-# Share of a step by which times may be off, as they are when rounded to a few digits. Ten times
-# more would pass steps that visibly differ.
+_OF_MOTIONS = {
+    "t": {"s": 1.0, "ms": 0.001},
+    **dict.fromkeys(("q", "sigma_q"), _KINDS["q"]),
+}
+# Share of a step by which times may be off, as they are when rounded to a few digits.
+# Ten times more would pass steps that visibly differ.
 UNEVEN_STEPS = 1e-3
 _HEADER = re.compile(r"(t|[a-z_]+(?=_))(?:_([1-9][0-9]*))?\s*(?:\[([^]]*)\])?")
 _COMMENT = re.compile(r"comment(_.*)?")  # a column that is not read
 _ALLOWED = (
-    "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ... "
-    "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`; `comment` is not read)"
+    "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, "
+    "3, ... "
+    "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`; `comment` is not "
+    "read)"
 )
 _HOW = "columns are separated by commas, numbers have a decimal point"
-_ALLOWED_OF_MOTIONS = "`t[s]`, `q_1[unit]`, `sigma_q_1[unit]`, and so on for coordinates 2, 3, ..."
+_ALLOWED_OF_MOTIONS = (
+    "`t[s]`, `q_1[unit]`, `sigma_q_1[unit]`, and so on for coordinates 2, 3, ..."
+)
 
 
 class ShotTable(NamedTuple):
-    """The columns of a file of shots in SI units, by kind, each (K, number of bodies)."""
+    """The columns of a file of shots in SI units, by kind, each (K, number of
+    bodies).
+    """
 
     values: dict[str, np.ndarray]
     units: list[str]  # of the velocities
@@ -53,7 +66,9 @@ class ShotTable(NamedTuple):
 
 
 def read_shots(path: str | Path) -> ShotTable:
-    """Read and check a file of shots, see `ji.read_experiments`; a warning reports NaN cells."""
+    """Read and check a file of shots, see `ji.read_experiments`; a warning reports NaN
+    cells.
+    """
     where, columns, rows = _read(path, _KINDS, _ALLOWED, "shot")
     counts = _check_columns(where, columns)
     values = _values(columns, rows, counts)
@@ -64,7 +79,9 @@ def read_shots(path: str | Path) -> ShotTable:
 
 
 class Positions(NamedTuple):
-    """A measured motion: times (S,) [s], positions (S, n), their errors or None; SI units."""
+    """A measured motion: times (S,) [s], positions (S, n), their errors or None; SI
+    units.
+    """
 
     time: np.ndarray
     q: np.ndarray
@@ -72,18 +89,24 @@ class Positions(NamedTuple):
 
 
 def read_positions(path: str | Path) -> Positions:
-    """Read and check a motion: columns `t[s]`, `q_1[m]`, ..., perhaps `sigma_q_1[m]`, ...
+    """Read and check a motion: columns `t[s]`, `q_1[m]`, ..., perhaps `sigma_q_1[m]`,
+    ...
 
     Times are equally spaced; an empty `q` cell was not measured.
     """
     where, columns, rows = _read(path, _OF_MOTIONS, _ALLOWED_OF_MOTIONS, "sample")
     keys = [(c.kind, c.body) for c in columns]
     size = max(body for _, body in keys)
-    kinds = [kind for kind in ("q", "sigma_q") if kind == "q" or any(k == kind for k, _ in keys)]
+    kinds = [
+        kind
+        for kind in ("q", "sigma_q")
+        if kind == "q" or any(k == kind for k, _ in keys)
+    ]
     required = [("t", 1), *((kind, i + 1) for kind in kinds for i in range(size))]
     if sorted(keys) != sorted(required):
         raise ValueError(
-            f"{where}: the columns must be {', '.join(f'`{k}_{i}`' for k, i in required[1:])} and "
+            f"{where}: the columns must be "
+            f"{', '.join(f'`{k}_{i}`' for k, i in required[1:])} and "
             f"`t`, each once, but are {', '.join(c.header for c in columns)}."
         )
     values = _values(columns, rows, dict.fromkeys(("t", *kinds), size))
@@ -94,13 +117,16 @@ def read_positions(path: str | Path) -> Positions:
 
 
 def _last_digit(cell: str) -> float:
-    """The value of one unit in the last digit of a number as it is written: .001 of '0.033'."""
+    """The value of one unit in the last digit of a number as it is written: .001 of
+    '0.033'.
+    """
     mantissa, _, power = cell.lower().partition("e")
     return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
 
 
 def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
-    """Times (S,) in equal steps: as they are, or a line through them if they were rounded.
+    """Times (S,) in equal steps: as they are, or a line through them if they were
+    rounded.
 
     Args:
         where: beginning of a message.
@@ -122,8 +148,10 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
     if off.max() > allowed:
         k = int(off.argmax())
         raise ValueError(
-            f"{where}: the times `t` must rise in equal steps, but sample {k + 1} at {time[k]:g} s "
-            f"is {off[k]:.2g} s off steps of {step:.6g} s; as they are written they may be "
+            f"{where}: the times `t` must rise in equal steps, but sample {k + 1} at "
+            f"{time[k]:g} s "
+            f"is {off[k]:.2g} s off steps of {step:.6g} s; as they are written they "
+            f"may be "
             f"{allowed:.2g} s off."
         )
     slope, start = np.polyfit(np.arange(len(time)), time, 1)
@@ -150,17 +178,23 @@ def _read(
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: the file must be UTF-8 text, but is not ({error}).") from None
+        raise ValueError(
+            f"{path}: the file must be UTF-8 text, but is not ({error})."
+        ) from None
     reader = csv.reader(text.splitlines())
     lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     rows = [(f"{path}, line {number}", row) for number, row in lines if any(row)]
     if not rows:
-        raise ValueError(f"{path}: the file is empty; its first line must name the columns.")
+        raise ValueError(
+            f"{path}: the file is empty; its first line must name the columns."
+        )
     where, headers = rows[0]
     read = [i for i, header in enumerate(headers) if not _COMMENT.fullmatch(header)]
     columns = [_column(where, i, headers[i], kinds, allowed) for i in read]
     if len(rows) == 1:
-        raise ValueError(f"{path}: the file has no {what}s; each line below the header is one.")
+        raise ValueError(
+            f"{path}: the file has no {what}s; each line below the header is one."
+        )
     for line, row in rows[1:]:
         if len(row) != len(headers):
             raise ValueError(
@@ -181,9 +215,14 @@ class CsvColumn(NamedTuple):
 
 
 def _column(
-    where: str, index: int, header: str, kinds: dict[str, dict[str, float]], allowed: str
+    where: str,
+    index: int,
+    header: str,
+    kinds: dict[str, dict[str, float]],
+    allowed: str,
 ) -> CsvColumn:
-    """The column that a header cell such as `post_1[m/s]` names; a ValueError for any other text.
+    """The column that a header cell such as `post_1[m/s]` names; a ValueError for any
+    other text.
 
     Args:
         where: beginning of a message.
@@ -195,15 +234,28 @@ def _column(
     if header == "shot" and kinds is _KINDS:
         return CsvColumn(header, "shot", 0, 1.0, "")
     match = _HEADER.fullmatch(header)
-    kind, body, unit = match.groups() if match else ("", None, "")
+    if match:
+        kind, body, unit = match.groups()
+    else:
+        kind = ""
+        body = None
+        unit = ""
     if kind not in kinds or (body is None) != (kind == "t"):
         separated = ";" in header or "\t" in header
-        advice = _HOW if separated else "the first line names columns, bodies count from 1"
+        if separated:
+            advice = _HOW
+        else:
+            advice = "the first line names columns, bodies count from 1"
         raise ValueError(
-            f"{where}: column {index + 1} must be one of {allowed}, but has name {header!r} "
+            f"{where}: column {index + 1} must be one of {allowed}, but has name "
+            f"{header!r} "
             f"({advice})."
         )
-    units, name = kinds[kind], kind if body is None else f"{kind}_{body}"
+    units = kinds[kind]
+    if body is None:
+        name = kind
+    else:
+        name = f"{kind}_{body}"
     if not unit:
         raise ValueError(
             f"{where}: column `{header}` must state its unit, as in "
@@ -211,28 +263,42 @@ def _column(
         )
     if unit.strip() not in units:
         raise ValueError(
-            f"{where}: the unit of column `{header}` must be one of {', '.join(units)}, "
+            f"{where}: the unit of column `{header}` must be one of "
+            f"{', '.join(units)}, "
             f"but is {unit!r}."
         )
-    base = ANGULAR if unit.strip() in ("rad/s", "deg/s") else LINEAR
+    if unit.strip() in ("rad/s", "deg/s"):
+        base = ANGULAR
+    else:
+        base = LINEAR
     return CsvColumn(header, kind, int(body or 1), units[unit.strip()], base)
 
 
 def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
-    """Number of columns of each kind; a ValueError for repeated, missing and mixed ones."""
+    """Number of columns of each kind; a ValueError for repeated, missing and mixed
+    ones.
+    """
     keys = [(c.kind, c.body) for c in columns]
     velocities = [c for c in columns if c.kind in (*_NEEDED, *_ERRORS)]
     for column, key in zip(columns, keys):
         if keys.count(key) > 1:
-            raise ValueError(f"{where}: column `{column.header}` must occur once, but is repeated.")
+            raise ValueError(
+                f"{where}: column `{column.header}` must occur once, but is repeated."
+            )
         others = {c.unit for c in velocities if c.body == column.body}
         if column in velocities and len(others) > 1:
             raise ValueError(
-                f"{where}: all columns of velocity {column.body} must be in m/s or all in rad/s, "
+                f"{where}: all columns of velocity {column.body} must be in m/s or all "
+                f"in rad/s, "
                 "but some are in each."
             )
-    kinds = [kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)]
-    bodies = max(1, *(c.body for c in velocities)) if velocities else 1
+    kinds = [
+        kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)
+    ]
+    if velocities:
+        bodies = max(1, *(c.body for c in velocities))
+    else:
+        bodies = 1
     counts = {  # one for each body; gaps and coordinates q may be more or fewer
         kind: bodies
         if kind in (*_NEEDED, *_ERRORS, "mass")
@@ -240,11 +306,14 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
         for kind in kinds
     }
     # of every kind, columns 1 to its count
-    required = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
+    required = [
+        (i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]
+    ]
     missing = [f"{kind}_{i}" for i, kind in required if (kind, i) not in keys]
     if missing:
         raise ValueError(
-            f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to {bodies} needs "
+            f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to "
+            f"{bodies} needs "
             f"{', '.join(f'`{kind}`' for kind in kinds if kind not in ('gap', 'q'))}."
         )
     return counts
@@ -253,7 +322,8 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
 def _values(
     columns: list[CsvColumn], rows: list[tuple[str, list[str]]], counts: dict[str, int]
 ) -> dict[str, np.ndarray]:
-    """The cells in SI units by kind (rows, `counts[kind]`), checked; NaN where they are empty.
+    """The cells in SI units by kind (rows, `counts[kind]`), checked; NaN where they are
+    empty.
 
     A warning reports cells with the text NaN.
     """
@@ -274,7 +344,8 @@ def _values(
                 _check_error(line, column, not np.isnan(measured), error)
     if not_numbers:
         warnings.warn(
-            f"{not_numbers[0]}: the cell is NaN and counts as not measured, as an empty one does; "
+            f"{not_numbers[0]}: the cell is NaN and counts as not measured, as an "
+            f"empty one does; "
             f"{len(not_numbers)} cells of the file are.",
             stacklevel=1,  # one place for all callers: Python reports it once
         )
@@ -287,10 +358,15 @@ def _is_nan(cell: str) -> bool:
 
 
 def _number(where: str, column: CsvColumn, cell: str) -> float:
-    """The number in a cell, in SI units; NaN if it is empty, where the column allows that."""
+    """The number in a cell, in SI units; NaN if it is empty, where the column allows
+    that.
+    """
     if cell == "" or _is_nan(cell):
         if column.kind in ("pre", "mass", "gap", "t"):
-            what = "a velocity before the impact" if column.kind == "pre" else "this"
+            if column.kind == "pre":
+                what = "a velocity before the impact"
+            else:
+                what = "this"
             raise ValueError(
                 f"{where}: {what} must be given, but the cell is "
                 f"{cell!r}; only `post` may be left empty (not measured)."
@@ -310,11 +386,17 @@ def _number(where: str, column: CsvColumn, cell: str) -> float:
 
 
 def _check_error(where: str, column: CsvColumn, measured: bool, error: float) -> None:
-    """Raise a ValueError if the standard error of a measured value is missing or not positive."""
+    """Raise a ValueError if the standard error of a measured value is missing or not
+    positive.
+    """
     exact = column.kind == "sigma_pre" and error == 0  # as of what is at rest
     if measured and not error > 0 and not exact:
-        value = "is empty" if np.isnan(error) else f"is {error / column.factor:g}"
+        if np.isnan(error):
+            value = "is empty"
+        else:
+            value = f"is {error / column.factor:g}"
         raise ValueError(
-            f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
+            f"{where}, column `{column.header}`: the error of a measured value must be "
+            f"> 0, "
             f"but {value}."
         )

@@ -1,4 +1,4 @@
-"""Theory of impacts with several contacts: admissible sets, audits of matrices, bounds, rocking.
+"""Theory of impacts with several contacts: sets, audits of matrices, bounds.
 
 >>> import jimpact as ji
 >>> cradle = ji.chain([1.0, 1.0, 1.0])

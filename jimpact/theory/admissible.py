@@ -6,7 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.core.scene import Scene, as_velocity, dense_mass, gap_velocity, kinetic_energy
+from jimpact.core.scene import (
+    Scene,
+    as_velocity,
+    dense_mass,
+    gap_velocity,
+    kinetic_energy,
+)
 from jimpact.theory.capped_polyhedron import (
     CappedPolyhedron,
     capped_polyhedron,
@@ -15,11 +21,11 @@ from jimpact.theory.capped_polyhedron import (
 from jimpact.tools.checks import as_float_array, as_whole, check_values
 from jimpact.tools.status import sign_tolerance
 
-# Contacts count as redundant when the matrix of their cosines has an eigenvalue below this
-# multiple of eps * m.
+# Contacts count as redundant when the matrix of their cosines has an eigenvalue below
+# this multiple of eps * m.
 _SINGULAR = 100.0
-# A contact approaches when |qn-| exceeds this multiple of eps times the speed sqrt(2 T). Ten times
-# more would leave slow approaches out of the set.
+# A contact approaches when |qn-| exceeds this multiple of eps times the speed sqrt(2
+# T). Ten times more would leave slow approaches out of the set.
 _APPROACH = 64.0
 _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 
@@ -29,10 +35,10 @@ class AdmissibleSet:
     """The outcomes v+ of `admissible_set`; `print(result)` describes them.
 
     Every outcome is v = `centre` + `axes` u, u (d,) in a convex set `coordinates`, with
-    `axes^T M axes = I`, and has the energy `T(centre) + |u|^2 / 2`: u are kinetic coordinates
-    [sqrt(J)]. `dimension` d is 0 where only one outcome is possible. `plastic` v+ (n,) has the
-    `least_energy` [J]; `energy` is T-. `scene` and `velocity` v- (n,) [m/s] are the arguments,
-    `tolerance` that of `contains`.
+    `axes^T M axes = I`, and has the energy `T(centre) + |u|^2 / 2`: u are kinetic
+    coordinates [sqrt(J)]. `dimension` d is 0 where only one outcome is possible.
+    `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-. `scene` and `velocity`
+    v- (n,) [m/s] are the arguments, `tolerance` that of `contains`.
     """
 
     scene: Scene
@@ -50,7 +56,9 @@ class AdmissibleSet:
 
     @cached_property
     def plastic(self) -> np.ndarray:
-        """v+ (n,) [m/s] of least energy: every contact that carries an impulse remains closed."""
+        """v+ (n,) [m/s] of least energy: every contact that carries an impulse remains
+        closed.
+        """
         return self._velocity(self.coordinates.project(np.zeros(self.dimension)))
 
     @property
@@ -62,22 +70,28 @@ class AdmissibleSet:
     def bounds(self) -> np.ndarray:
         """Least and greatest value of every coordinate of v+, (n, 2) [m/s].
 
-        Each is a linear function over the convex set, solved to rounding (about 1e-9 of the
-        impact's size).
+        Each is a linear function over the convex set, solved to rounding (about 1e-9 of
+        the impact's size).
         """
-        # v_i = centre_i + c . u with row c of the axes: v+ where it is least, and greatest
+        # v_i = centre_i + c . u with row c of the axes: v+ where it is least, and
+        # greatest
         ends = [
-            [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)] for c in self.axes
+            [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)]
+            for c in self.axes
         ]
         return np.array([[low[i], high[i]] for i, (low, high) in enumerate(ends)])
 
-    def contains(self, velocity: Any, tolerance: float | None = None) -> bool | np.ndarray:
-        """True for a velocity v+ (n,) [m/s], or each of (k, n), that is admissible up to an error.
+    def contains(
+        self, velocity: Any, tolerance: float | None = None
+    ) -> bool | np.ndarray:
+        """True for a velocity v+ (n,) [m/s], or each of (k, n), that is admissible up
+        to an error.
 
-        Equation: with `v - centre = axes u + w`, `u = axes^T M (v - centre)`, the error is the
-        larger of `sqrt(w^T M w)`, which violates the balance of momentum, and of how much u
-        violates a facet or the cap of the convex set [sqrt(J)]. It may be `tolerance` times the
-        size of the impact, `sqrt(2 (T- - T(centre)))`, the largest |u|; None: that of `audit`.
+        Equation: with `v - centre = axes u + w`, `u = axes^T M (v - centre)`, the error
+        is the larger of `sqrt(w^T M w)`, which violates the balance of momentum, and of
+        how much u violates a facet or the cap of the convex set [sqrt(J)]. It may be
+        `tolerance` times the size of the impact, `sqrt(2 (T- - T(centre)))`, the
+        largest |u|; None: that of `audit`.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)
         if v.ndim not in (1, 2) or v.shape[-1] != self.scene.size:
@@ -87,7 +101,10 @@ class AdmissibleSet:
             )
         check_values("velocity", v)
         check_values("tolerance", tolerance, low=0.0)
-        allowed = self.tolerance if tolerance is None else tolerance
+        if tolerance is None:
+            allowed = self.tolerance
+        else:
+            allowed = tolerance
         offset = v - self.centre
         mass = dense_mass(self.scene)
         u = offset @ mass @ self.axes
@@ -95,25 +112,31 @@ class AdmissibleSet:
         square = np.einsum("...i,ij,...j->...", w, mass, w)
         error = np.maximum(self.coordinates.excess(u), np.sqrt(np.maximum(square, 0.0)))
         inside = error <= allowed * self._size
-        return bool(inside) if v.ndim == 1 else inside
+        if v.ndim == 1:
+            return bool(inside)
+        return inside
 
     def sample(self, seed: int, count: int) -> np.ndarray:
-        """`count` outcomes v+ (count, n) [m/s], uniform in kinetic coordinates; fixed by the seed.
+        """`count` outcomes v+ (count, n) [m/s], uniform in kinetic coordinates; fixed
+        by the seed.
 
-        Hit-and-run from an interior point, one walk a sample. For independent contacts, uniform
-        in impulse space too.
+        Hit-and-run from an interior point, one walk a sample. For independent contacts,
+        uniform in impulse space too.
         """
         as_whole("count", count, 1)
         if self.dimension == 0:
             return np.repeat(self.centre[None], count, axis=0)
-        return self._velocity(self.coordinates.sample(np.random.default_rng(seed), count))
+        return self._velocity(
+            self.coordinates.sample(np.random.default_rng(seed), count)
+        )
 
     def conserving_arc(self, points: int = 100) -> np.ndarray:
-        """Outcomes v+ with T+ = T- of two contacts: an arc (points, n) [m/s] from A to B.
+        """Outcomes v+ with T+ = T- of two contacts: an arc (points, n) [m/s] from A to
+        B.
 
-        Evenly spaced in the angle of the circle |u| = sqrt(2 (T- - T(centre))). At A the normalized
-        gap velocity of the first closed contact is smaller. Shape (0, n) if redundant contacts
-        leave no such outcome.
+        Evenly spaced in the angle of the circle |u| = sqrt(2 (T- - T(centre))). At A
+        the normalized gap velocity of the first closed contact is smaller. Shape (0, n)
+        if redundant contacts leave no such outcome.
 
         Raises:
             ValueError: the set is not two-dimensional.
@@ -125,12 +148,16 @@ class AdmissibleSet:
             return np.zeros((0, self.scene.size))
         arc = self._velocity(self.coordinates.on_circle(np.linspace(*ends, points)))
         first = np.asarray(self.scene.normals)[:, int(np.argmax(self.scene.closed))]
-        return arc[::-1] if arc[0] @ first > arc[-1] @ first else arc
+        if arc[0] @ first > arc[-1] @ first:
+            return arc[::-1]
+        return arc
 
     def boundary(self, points: int = 100) -> np.ndarray:
-        """Velocities v+ (k, n) [m/s] around the boundary of a plane set, corners included.
+        """Velocities v+ (k, n) [m/s] around the boundary of a plane set, corners
+        included.
 
-        On a straight side one gap velocity gamma+ or one impulse is 0; `points` lie on the arc
+        On a straight side one gap velocity gamma+ or one impulse is 0; `points` lie on
+        the arc
         T+ = T-.
 
         Raises:
@@ -141,10 +168,15 @@ class AdmissibleSet:
         return self._velocity(self.coordinates.boundary(points))
 
     def __str__(self) -> str:
-        """Table of the set: T+ [J] and, for each coordinate, v- and the range of v+ [m/s]."""
+        """Table of the set: T+ [J] and, for each coordinate, v- and the range of v+
+        [m/s].
+        """
         closed = np.asarray(self.scene.closed)
         approaching = np.asarray(gap_velocity(self.scene, self.velocity))[closed] < 0
-        head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
+        head = (
+            f"closed contacts: {int(closed.sum())}, approaching: "
+            f"{int(approaching.sum())};"
+        )
         smallest = _ZERO * max(1e-300, float(np.abs(self.velocity).max()))
 
         def show(x: float, width: int = 0) -> str:
@@ -152,15 +184,23 @@ class AdmissibleSet:
             return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
 
         if self.dimension == 0:
-            return f"{head} one admissible outcome, v+ = ({', '.join(map(show, self.centre))})"
+            return (
+                f"{head} one admissible outcome, v+ = "
+                f"({', '.join(map(show, self.centre))})"
+            )
         lines = [
             f"{head} admissible outcomes of dimension {self.dimension}",
-            f"energy       from {self.least_energy:.6g} J (plastic) to {self.energy:.6g} J (T-)",
+            (
+                f"energy       from {self.least_energy:.6g} J (plastic) to "
+                f"{self.energy:.6g} J (T-)"
+            ),
             "coordinate          v-         least       plastic      greatest   [m/s]",
         ]
         columns = zip(self.velocity, self.bounds[:, 0], self.plastic, self.bounds[:, 1])
         for i, (before, *after) in enumerate(columns):
-            lines.append(f"{i + 1:10d}{show(before, 12)}" + "".join(show(x, 14) for x in after))
+            lines.append(
+                f"{i + 1:10d}{show(before, 12)}" + "".join(show(x, 14) for x in after)
+            )
         if self.dimension == 2:
             for name, v in zip("AB", self.conserving_arc(2)):
                 lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
@@ -168,7 +208,9 @@ class AdmissibleSet:
 
     @property
     def _size(self) -> float:
-        """Size of the impact, the largest |u| = sqrt(2 (T- - T(centre))) [sqrt(J)]; never 0."""
+        """Size of the impact, the largest |u| = sqrt(2 (T- - T(centre))) [sqrt(J)];
+        never 0.
+        """
         return self.coordinates.radius or float(np.sqrt(2 * self.energy)) or 1.0
 
     def _velocity(self, u: np.ndarray) -> np.ndarray:
@@ -179,16 +221,18 @@ class AdmissibleSet:
         """Raise a ValueError unless the set is two-dimensional."""
         if self.dimension != 2:
             raise ValueError(
-                "An arc and a boundary need a set of dimension 2 (two independent contacts), but "
+                "An arc and a boundary need a set of dimension 2 (two independent "
+                "contacts), but "
                 f"this one has dimension {self.dimension}."
             )
 
 
 def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
-    """All outcomes v+ of an impact that are kinematically, kinetically, energetically consistent.
+    """All v+ that are kinematically, kinetically, energetically consistent.
 
-    Equation: `v+ = v- + M^-1 N p` with `p >= 0`, `gamma+ >= 0` at closed contacts (p = 0 at open
-    ones) and `T+ <= T-`. In kinetic coordinates the set is the part of a ball between flat
+    Equation: `v+ = v- + M^-1 N p` with `p >= 0`, `gamma+ >= 0` at closed contacts (p =
+    0 at open ones) and `T+ <= T-`. In kinetic coordinates the set is the part of a ball
+    between flat
     walls; for two contacts, the region under an arc A-B of the circle of equal energy.
 
     Args:
@@ -196,16 +240,18 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
         velocity: v- (n,) [m/s].
 
     Returns:
-        `AdmissibleSet`: `contains`, `bounds`, `plastic`, `least_energy`, `sample`, and for two
-        contacts `conserving_arc`, `boundary`. Without an approaching contact it is v- alone.
+        `AdmissibleSet`: `contains`, `bounds`, `plastic`, `least_energy`, `sample`, and
+        for two contacts `conserving_arc`, `boundary`. Without an approaching contact it
+        is v- alone.
 
     Raises:
-        ValueError: shape, NaN, a velocity against the bilateral constraints; too many redundant
-            contacts, so that the cone of impulses cannot be enumerated.
+        ValueError: shape, NaN, a velocity against the bilateral constraints; too many
+            redundant contacts, so that the cone of impulses cannot be enumerated.
 
     Host function, not differentiable.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), 6.1.1.2-6.1.1.3, (6.5)-(6.8), Fig. 6.3.
+    Source: Brogliato, Nonsmooth Mechanics (2016), 6.1.1.2-6.1.1.3, (6.5)-(6.8), Fig.
+    6.3.
 
     >>> import jimpact as ji
     >>> result = admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
@@ -216,14 +262,17 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     """
     v = as_velocity(scene, velocity, finite=True)
     tolerance = sign_tolerance(scene.mass.dtype)
-    start, closed = np.asarray(v, float), np.asarray(scene.closed)
+    start = np.asarray(v, float)
+    closed = np.asarray(scene.closed)
     root = np.linalg.cholesky(dense_mass(scene))  # y = root^T v has T = |y|^2 / 2
     y = root.T @ start
     free = _constraint_projector(scene, root, y, tolerance)
     # one column for each closed contact: qn = unit^T y, its normal in the coordinates y
     unit = np.linalg.solve(root, np.asarray(scene.normals, float)[:, closed])
     unit = unit / np.linalg.norm(unit, axis=0)
-    approach = unit.T @ y < -_APPROACH * np.finfo(scene.mass.dtype).eps * np.linalg.norm(y)
+    approach = unit.T @ y < -_APPROACH * np.finfo(
+        scene.mass.dtype
+    ).eps * np.linalg.norm(y)
     energy = 0.5 * float(y @ y)
     outcomes = partial(AdmissibleSet, scene, start, energy=energy, tolerance=tolerance)
     if not approach.any():
@@ -231,36 +280,44 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
         return outcomes(centre=start, axes=np.zeros((len(start), 0)), coordinates=alone)
     unit = free @ unit
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * unit.shape[1]
-    unit = unit[:, np.sum(unit**2, axis=0) > floor]  # not contacts that constraints hold
+    # not contacts that constraints hold
+    unit = unit[:, np.sum(unit**2, axis=0) > floor]
     basis, singular, _ = np.linalg.svd(unit, full_matrices=False)
     basis = basis[:, singular**2 > floor]
     normal = basis.T @ unit  # contacts in the coordinates z = basis^T y
     before = basis.T @ y
-    # gamma+ >= 0: normal^T z >= 0; p >= 0: z - z- in the cone of the normals, facets (z - z-) >= 0
+    # gamma+ >= 0: normal^T z >= 0; p >= 0: z - z- in the cone of the normals, facets (z
+    # - z-) >= 0
     facets = cone_facets(normal)
     rows = np.vstack([normal.T, facets])
     offset = np.append(np.zeros(normal.shape[1]), facets @ before)
     redundant = basis.shape[1] < unit.shape[1]
-    part, centre, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
+    part, centre, axes = capped_polyhedron(
+        rows, offset, float(np.linalg.norm(before)), redundant
+    )
     rest = y - basis @ before + basis @ centre  # impulses leave y - basis z- as it is
-    centre, axes = np.linalg.solve(root.T, rest), np.linalg.solve(root.T, basis @ axes)
+    centre = np.linalg.solve(root.T, rest)
+    axes = np.linalg.solve(root.T, basis @ axes)
     return outcomes(centre=centre, axes=axes, coordinates=part)
 
 
 def _constraint_projector(
     scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """Projector `I - Q Q^T` (n, n) onto directions y that bilateral constraints H leave free.
+    """Projector `I - Q Q^T` (n, n) onto directions y that bilateral constraints H leave
+    free.
 
-    y = root^T v are coordinates with T = |y|^2 / 2, `root root^T = M`, and the columns of Q are an
-    orthonormal basis of root^-1 H: `H^T v = 0` is `Q^T y = 0`, to `tolerance` |y|.
+    y = root^T v are coordinates with T = |y|^2 / 2, `root root^T = M`, and the columns
+    of Q are an orthonormal basis of root^-1 H: `H^T v = 0` is `Q^T y = 0`, to
+    `tolerance` |y|.
     """
     if scene.constraints is None:
         return np.eye(len(y))
     basis = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]
     if np.linalg.norm(basis.T @ y) > tolerance * np.linalg.norm(y):
         raise ValueError(
-            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but is "
+            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
+            "0, but is "
             f"{np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
         )
     return np.eye(len(y)) - basis @ basis.T

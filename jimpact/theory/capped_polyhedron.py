@@ -1,4 +1,6 @@
-"""The convex set `{w: A w >= b, |w| <= r}` on the host: extremes, samples, plane boundary."""
+"""The convex set `{w: A w >= b, |w| <= r}` on the host: extremes, samples, plane
+boundary.
+"""
 
 from itertools import combinations
 from math import comb
@@ -11,7 +13,8 @@ _FLAT = 1e-6  # a row whose slack stays below this everywhere is an equality
 _ROUNDING = 1e-10  # feasibility of points that are computed in closed form
 _INDEPENDENT = 1e-8  # relative singular value that counts as nonzero
 _MOST_FACETS = 20_000  # bound on the facets of a cone; more take minutes
-_FARTHEST = 1e8  # distance after which the search for a minimum gives up and takes what it has
+# distance after which the search for a minimum gives up and takes what it has
+_FARTHEST = 1e8
 _GRADIENT = 1e-12  # of least squares: a gradient below this is zero
 _ROUNDS = 10  # of least squares: rounds per column; two are usual
 _MIXING = 30  # hit-and-run steps per dimension; every sample has its own walk
@@ -25,7 +28,8 @@ class CappedPolyhedron(NamedTuple):
     radius: float
 
     def excess(self, w: np.ndarray) -> np.ndarray:
-        """Largest violation of a bound at w (..., d), `max(|w| - radius, offset_i - rows_i w)`.
+        """Largest violation of a bound at w (..., d),
+        `max(|w| - radius, offset_i - rows_i w)`.
 
         0 or less inside the set.
         """
@@ -36,8 +40,9 @@ class CappedPolyhedron(NamedTuple):
     def project(self, point: np.ndarray) -> np.ndarray:
         """Point w (d,) nearest to `point` with `rows w >= offset`, whatever the radius.
 
-        Least distance programming (Lawson and Hanson 1974, ch. 23): rows with a positive multiplier
-        x hold with equality, x the nonnegative least squares solution of
+        Least distance programming (Lawson and Hanson 1974, ch. 23): rows with a
+        positive multiplier x hold with equality, x the nonnegative least squares
+        solution of
         `[rows, need]^T x = (0, ..., 0, 1)`, `need = offset - rows point`.
         """
         need = self.offset - self.rows @ point
@@ -57,7 +62,8 @@ class CappedPolyhedron(NamedTuple):
             return self.project(np.zeros_like(direction))
         c = direction / length
 
-        # minimizes c.w + |w|^2 / (2 s); |w| grows with s until the ball or a least c.w ends it
+        # minimizes c.w + |w|^2 / (2 s); |w| grows with s until the ball or a least c.w
+        # ends it
         def beyond(s: float) -> float:
             """Distance of the minimizer of this s from the ball; negative inside."""
             return float(np.linalg.norm(self.project(-s * c)) - self.radius)
@@ -66,9 +72,13 @@ class CappedPolyhedron(NamedTuple):
         while beyond(far) < 0:
             w = self.project(-far * c)
             touching = self.rows[self.rows @ w - self.offset <= _ROUNDING * self.radius]
-            # c in the cone of the rows that hold with equality: c.w is least here without the ball
+            # c in the cone of the rows that hold with equality: c.w is least here
+            # without the ball
             in_cone = touching.T @ least_squares(touching.T, c)
-            if np.linalg.norm(in_cone - c) <= _ROUNDING or far > _FARTHEST * self.radius:
+            if (
+                np.linalg.norm(in_cone - c) <= _ROUNDING
+                or far > _FARTHEST * self.radius
+            ):
                 return w
             far *= 4
         if beyond(0.0) >= 0:
@@ -79,8 +89,9 @@ class CappedPolyhedron(NamedTuple):
     def interior(self) -> np.ndarray:
         """A point (d,) with distance to the bounds, to start walks from.
 
-        It lies between `least`, the point nearest to the origin, and `deep`, which has the largest
-        slack t in `rows w >= offset + t`, `|w_i| <= radius`: half way, or half way to the sphere.
+        It lies between `least`, the point nearest to the origin, and `deep`, which has
+        the largest slack t in `rows w >= offset + t`, `|w_i| <= radius`: half way, or
+        half way to the sphere.
         """
         from scipy.optimize import linprog  # late: slow to import
 
@@ -93,55 +104,82 @@ class CappedPolyhedron(NamedTuple):
         step = deep - least
         if not step.any():
             return least
-        return least + 0.5 * min(1.0, _chord(least[None], step[None], self.radius)[1][0]) * step
+        return (
+            least
+            + 0.5 * min(1.0, _chord(least[None], step[None], self.radius)[1][0]) * step
+        )
 
     def sample(self, generator: np.random.Generator, count: int) -> np.ndarray:
-        """`count` points (count, d), uniform: each the end of its own hit-and-run walk."""
+        """`count` points (count, d), uniform: each the end of its own hit-and-run
+        walk.
+        """
         dimension = self.rows.shape[1]
         points = np.repeat(self.interior()[None], count, axis=0)
         for _ in range(_MIXING * dimension):
             step = generator.normal(size=points.shape)
             step /= np.linalg.norm(step, axis=1, keepdims=True)
-            # along w = point + t step the slack of row i, slack_i + t rate_i, is 0 at t = reach_i
+            # along w = point + t step the slack of row i, slack_i + t rate_i, is 0 at t
+            # = reach_i
             slack = np.maximum(points @ self.rows.T - self.offset, 0.0)
             rate = step @ self.rows.T
             with np.errstate(divide="ignore", invalid="ignore"):
                 reach = -slack / rate
             low, high = _chord(points, step, self.radius)
-            high = np.minimum(high, np.where(rate < 0, reach, np.inf).min(1, initial=np.inf))
-            low = np.maximum(low, np.where(rate > 0, reach, -np.inf).max(1, initial=-np.inf))
+            high = np.minimum(
+                high, np.where(rate < 0, reach, np.inf).min(1, initial=np.inf)
+            )
+            low = np.maximum(
+                low, np.where(rate > 0, reach, -np.inf).max(1, initial=-np.inf)
+            )
             position = low + (high - low) * generator.random(count)
             points = points + position[:, None] * step
         return points
 
     def arc(self) -> tuple[float, float] | None:
-        """First and last angle [rad] of the part of the circle |w| = r in the set; d = 2 only.
+        """First and last angle [rad] of the part of the circle |w| = r in the set; d =
+        2 only.
 
-        Row i meets the circle at its own angle +- arccos(offset_i / r). The set is expected to have
-        one such part; of several, one is returned.
+        Row i meets the circle at its own angle +- arccos(offset_i / r). The set is
+        expected to have one such part; of several, one is returned.
         """
         angle = np.arctan2(self.rows[:, 1], self.rows[:, 0])
         cut = np.abs(self.offset) <= self.radius
         half = np.arccos(self.offset[cut] / self.radius)
-        ends = np.sort(np.concatenate([angle[cut] - half, angle[cut] + half]) % (2 * np.pi))
+        ends = np.sort(
+            np.concatenate([angle[cut] - half, angle[cut] + half]) % (2 * np.pi)
+        )
         if len(ends) == 0:
-            inside = self.excess(self.on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
-            return (0.0, 2 * np.pi) if inside else None
-        # pieces of the circle between neighbouring ends; feasible: its midpoint is in the set
+            inside = (
+                self.excess(self.on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
+            )
+            if inside:
+                return (0.0, 2 * np.pi)
+            return None
+        # pieces of the circle between neighbouring ends; feasible: its midpoint is in
+        # the set
         width = np.diff(np.append(ends, ends[0] + 2 * np.pi))
-        feasible = self.excess(self.on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
+        feasible = (
+            self.excess(self.on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
+        )
         if feasible.all():
             return 0.0, 2 * np.pi
-        # the feasible pieces that follow one that is not: from `first` to the next that is not
+        # the feasible pieces that follow one that is not: from `first` to the next that
+        # is not
         first = int(np.argmax(feasible & ~np.roll(feasible, 1)))
-        run, widths = np.roll(feasible, -first), np.roll(width, -first)
+        run = np.roll(feasible, -first)
+        widths = np.roll(width, -first)
         length = widths[: np.argmin(run)].sum()
-        return (float(ends[first]), float(ends[first] + length)) if run[0] else None
+        if run[0]:
+            return (float(ends[first]), float(ends[first] + length))
+        return None
 
     def boundary(self, arc_points: int) -> np.ndarray:
-        """Points (k, 2) of the boundary, counter-clockwise, with its corners; d = 2 only."""
+        """Points (k, 2) of the boundary, counter-clockwise, with its corners; d = 2
+        only.
+        """
         corners = [np.zeros((0, 2))]
-        for i, j in combinations(range(len(self.rows)), 2):  # where two rows hold with equality
+        # where two rows hold with equality
+        for i, j in combinations(range(len(self.rows)), 2):
             pair = self.rows[[i, j]]
             if abs(np.linalg.det(pair)) > _INDEPENDENT:
                 corners.append(np.linalg.solve(pair, self.offset[[i, j]])[None])
@@ -161,11 +199,12 @@ class CappedPolyhedron(NamedTuple):
 def capped_polyhedron(
     rows: np.ndarray, offset: np.ndarray, radius: float, may_be_flat: bool
 ) -> tuple[CappedPolyhedron, np.ndarray, np.ndarray]:
-    """`{w: rows w >= offset, |w| <= radius}` in coordinates u of its own dimension, centre, axes.
+    """`{w: rows w >= offset, |w| <= radius}` in coordinates u of its own dimension,
+    centre, axes.
 
-    Equation: `w = centre + axes u`, axes (d, d_u) orthonormal, `|w|^2 = |centre|^2 + |u|^2`. Rows
-    that hold with equality all over the set (sought where it `may_be_flat`) fix the centre (d,) and
-    the axes; the others bound u.
+    Equation: `w = centre + axes u`, axes (d, d_u) orthonormal,
+    `|w|^2 = |centre|^2 + |u|^2`. Rows that hold with equality all over the set (sought
+    where it `may_be_flat`) fix the centre (d,) and the axes; the others bound u.
     """
     from scipy.optimize import linprog  # late: slow to import
 
@@ -176,7 +215,8 @@ def capped_polyhedron(
         highest = [-linprog(-row, -rows, -offset, bounds=box).fun for row in rows]
         flat = np.array(highest) - offset <= _FLAT * radius
     _, singular, basis = np.linalg.svd(rows[flat])
-    axes = basis[int((singular > _INDEPENDENT).sum()) :].T  # null space of the equalities
+    # null space of the equalities
+    axes = basis[int((singular > _INDEPENDENT).sum()) :].T
     centre = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
     inner = float(np.sqrt(max(radius**2 - float(centre @ centre), 0.0)))
     offset = offset[~flat] - rows[~flat] @ centre
@@ -184,7 +224,9 @@ def capped_polyhedron(
     return CappedPolyhedron(*within, inner), centre, axes
 
 
-def _unit_rows(rows: np.ndarray, offset: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+def _unit_rows(
+    rows: np.ndarray, offset: np.ndarray, least: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The rows longer than `least` and their offsets, scaled to unit length."""
     length = np.linalg.norm(rows, axis=1)
     kept = length > least
@@ -194,12 +236,15 @@ def _unit_rows(rows: np.ndarray, offset: np.ndarray, least: float) -> tuple[np.n
 def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     """`x >= 0` of least `|matrix x - target|` (Lawson and Hanson 1974, ch. 23).
 
-    Of scipy (1.17), `nnls` and the method `bvls` of `lsq_linear` both miss the minimum of some
-    degenerate problems met here: with `nnls`, `test_random_scenes_against_oracles` fails.
+    Of scipy (1.17), `nnls` and the method `bvls` of `lsq_linear` both miss the minimum
+    of some degenerate problems met here: with `nnls`,
+    `test_random_scenes_against_oracles` fails.
     """
     count = matrix.shape[1]
     # passive: columns with x > 0; barred: columns that rounding keeps from growing
-    x, passive, barred = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
+    x = np.zeros(count)
+    passive = np.zeros(count, bool)
+    barred = np.zeros(count, bool)
     for _ in range(_ROUNDS * count):
         gradient = matrix.T @ (target - matrix @ x)
         gradient[passive | barred] = 0.0
@@ -209,29 +254,38 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
         passive[new] = True
         trial = _on_support(matrix, target, passive)
         if trial[new] <= 0:  # rounding: this column would not grow
-            passive[new], barred[new] = False, True
+            passive[new] = False
+            barred[new] = True
             continue
-        while (trial[passive] <= 0).any():  # go towards the trial until the first x is 0
+        # go towards the trial until the first x is 0
+        while (trial[passive] <= 0).any():
             low = np.flatnonzero(passive & (trial <= 0))
             steps = x[low] / (x[low] - trial[low])
             x = x + steps.min() * (trial - x)
             passive[low[steps == steps.min()]] = False
             trial = _on_support(matrix, target, passive)
-        x, barred[:] = trial, False
+        x = trial
+        barred[:] = False
     return x
 
 
-def _on_support(matrix: np.ndarray, target: np.ndarray, support: np.ndarray) -> np.ndarray:
-    """Minimizer x of `|matrix x - target|` with x = 0 off the support (a mask of columns)."""
+def _on_support(
+    matrix: np.ndarray, target: np.ndarray, support: np.ndarray
+) -> np.ndarray:
+    """Minimizer x of `|matrix x - target|` with x = 0 off the support (a mask of
+    columns).
+    """
     x = np.zeros(matrix.shape[1])
     x[support] = np.linalg.lstsq(matrix[:, support], target, rcond=None)[0]
     return x
 
 
 def cone_facets(generators: np.ndarray) -> np.ndarray:
-    """Rows F (f, r) of unit length with `{w: F w >= 0}` the cone of m generators (r, m) of rank r.
+    """Rows F (f, r) of unit length with `{w: F w >= 0}` the cone of m generators (r, m)
+    of rank r.
 
-    They are the facets through the origin of the convex hull of the origin and the generators.
+    They are the facets through the origin of the convex hull of the origin and the
+    generators.
 
     Raises:
         ValueError: m > r and too many facets are possible.
@@ -244,12 +298,15 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
         return inverse / np.linalg.norm(inverse, axis=1, keepdims=True)
     if comb(m, rank - 1) > _MOST_FACETS:
         raise ValueError(
-            f"Argument `scene` must have fewer redundant contacts: {m} contacts of rank {rank} "
+            f"Argument `scene` must have fewer redundant contacts: {m} contacts of "
+            f"rank {rank} "
             f"have more than {_MOST_FACETS} candidate facets."
         )
     unit = generators / np.linalg.norm(generators, axis=0)
     if rank == 1:  # hulls begin with two dimensions
-        return unit[:, :1] if np.ptp(unit) == 0 else np.zeros((0, 1))
+        if np.ptp(unit) == 0:
+            return unit[:, :1]
+        return np.zeros((0, 1))
     outward = ConvexHull(np.vstack([np.zeros(rank), unit.T])).equations
     normals = -outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
     # a facet that is no simplex is reported in parts; one that stays twice does no harm
@@ -257,11 +314,15 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
     return normals[np.sort(first)]
 
 
-def _chord(points: np.ndarray, steps: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters t (k,), (k,) at which lines `points + t steps` (k, d) enter and leave the ball.
+def _chord(
+    points: np.ndarray, steps: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters t (k,), (k,) at which lines `points + t steps` (k, d) enter and leave
+    the ball.
 
     Equation: roots of `|s|^2 t^2 + 2 p.s t + |p|^2 = radius^2`.
     """
-    a, b = (steps**2).sum(1), (points * steps).sum(1)
+    a = (steps**2).sum(1)
+    b = (points * steps).sum(1)
     root = np.sqrt(np.maximum(b**2 + a * (radius**2 - (points**2).sum(1)), 0.0))
     return (-b - root) / a, (-b + root) / a

@@ -1,4 +1,6 @@
-"""Kinetic energy after an impact: the part that is kept, and its spread over the coordinates."""
+"""Kinetic energy after an impact: the part that is kept, and its spread over the
+coordinates.
+"""
 
 from typing import Any
 
@@ -32,12 +34,12 @@ def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
 
 
 def energy_dispersion(scene: Scene, velocity: Any) -> jax.Array:
-    """C_KE, how unevenly the kinetic energy is spread: 0 equal shares, sqrt(n - 1) all in one.
+    """C_KE, how unevenly energy is spread: 0 equal, sqrt(n - 1) all in one.
 
     Equation: `sd(T_i) / mean(T_i)`, the coefficient of variation of the shares
-    `T_i = v_i (M v)_i / 2` of the n coordinates. For equal balls with v- = (1, 0, 0) and no loss:
-    sqrt(2) at (0, 0, 1), sqrt(2)/3 at (-1/3, 2/3, 2/3). `dispersion_index` is the same quantity
-    the other way round, from 0 to 1: `1 - C_KE / sqrt(n - 1)`.
+    `T_i = v_i (M v)_i / 2` of the n coordinates. For equal balls with v- = (1, 0, 0)
+    and no loss: sqrt(2) at (0, 0, 1), sqrt(2)/3 at (-1/3, 2/3, 2/3). `dispersion_index`
+    is the same quantity the other way round, from 0 to 1: `1 - C_KE / sqrt(n - 1)`.
     NaN at rest. Not differentiable at equal shares.
 
     Args:
@@ -61,16 +63,18 @@ def energy_dispersion(scene: Scene, velocity: Any) -> jax.Array:
     share = 0.5 * v * momentum(scene, v)
     mean = jnp.mean(share)
     square = jnp.mean((share - mean) ** 2)
-    # the inner `where` keeps the derivative of the root finite where all shares are equal
+    # the inner `where` keeps the derivative of the root finite where all shares are
+    # equal
     deviation = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     return deviation / mean
 
 
 def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
-    """Evenness of the kinetic energy's spread over the coordinates: 0 all in one, 1 equal shares.
+    """Evenness of kinetic energy over the coordinates: 0 all in one, 1 equal shares.
 
-    Equation: `1 - C_KE / sqrt(n - 1)`: C_KE (`energy_dispersion`) is at most `sqrt(n - 1)`. For
-    equal balls with v- = (1, 0, 0) and no loss: 0 at (0, 0, 1), 2/3 at (-1/3, 2/3, 2/3).
+    Equation: `1 - C_KE / sqrt(n - 1)`: C_KE (`energy_dispersion`) is at most
+    `sqrt(n - 1)`. For equal balls with v- = (1, 0, 0) and no loss: 0 at (0, 0, 1), 2/3
+    at (-1/3, 2/3, 2/3).
     NaN at rest, and for one coordinate. Not differentiable at equal shares.
 
     Args:

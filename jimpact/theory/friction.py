@@ -1,4 +1,6 @@
-"""Restitution with friction: the normal-cone inclusion; bounds for dissipation (Theorem 6.2)."""
+"""Restitution with friction: the normal-cone inclusion; bounds for dissipation (Theorem
+6.2).
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -7,7 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.core.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.core.contact import (
+    kinetic_norm,
+    normalized_delassus,
+    normalized_gap_velocity,
+)
 from jimpact.core.scene import Scene, velocity_change
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix
@@ -19,8 +25,8 @@ from jimpact.tools.compiling import full_precision
 class InclusionOutcome(NamedTuple):
     """Solution of `restitution_inclusion`.
 
-    `velocity`: quasi-velocities v+ (n,) [sqrt(J)]; `percussion` (c,) along the columns of the
-    coupling; `status` (), a code of `jimpact.STATUS`.
+    `velocity`: quasi-velocities v+ (n,) [sqrt(J)]; `percussion` (c,) along the columns
+    of the coupling; `status` (), a code of `jimpact.STATUS`.
     """
 
     velocity: jax.Array
@@ -30,9 +36,10 @@ class InclusionOutcome(NamedTuple):
 
 @full_precision
 def contact_coupling(scene: Scene) -> jax.Array:
-    """Matrix Gbar (n, m + t) from impulses (pbar, p_t) to changes of quasi-velocities (qn, qt).
+    """Matrix Gbar (n, m + t) from impulses (pbar, p_t) to changes of (qn, qt).
 
-    Equation: `Gbar = [[G, n_q^T H], [0, t_q^T H]]`, H the tangents (n, t), `pbar = |grad f| p`.
+    Equation: `Gbar = [[G, n_q^T H], [0, t_q^T H]]`, H the tangents (n, t),
+    `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m contacts, t tangents.
@@ -61,22 +68,28 @@ def contact_coupling(scene: Scene) -> jax.Array:
 
 @full_precision
 def restitution_inclusion(
-    coupling: Any, metric: Any, restitution: Any, velocity: Any, low: Any = 0.0, high: Any = jnp.inf
+    coupling: Any,
+    metric: Any,
+    restitution: Any,
+    velocity: Any,
+    low: Any = 0.0,
+    high: Any = jnp.inf,
 ) -> InclusionOutcome:
-    """Solve `v+ - v- in -Gbar N_V(Gamma (v+ + Lambda v-))` with `Gamma = Gbar^T P`, V a box.
+    """Solve `v+ - v- in -Gbar N_V(Gamma (v+ + Lambda v-))`, V a box.
 
     N_V is the normal cone of V, the box of all y with `low <= y <= high`.
 
-    Equation: `v+ = -Lambda v- + R^-1 proj[{x: Gbar^T R x in V}; R (Lambda + I) v-]`, `R^2 = P`.
-    With the multipliers of the projection, y = Gamma (v+ + Lambda v-), it reads `v+ = v- + Gbar p`,
-    `p_i >= 0` where y_i is at its lower bound, `<= 0` at its upper one, else 0: one linear
-    complementarity problem, and no square root.
+    Equation: `v+ = -Lambda v- + R^-1 proj[{x: Gbar^T R x in V}; R (Lambda + I)
+    v-]`, `R^2 = P`. With the multipliers of the projection, y = Gamma (v+ + Lambda v-),
+    it reads `v+ = v- + Gbar p`, `p_i >= 0` where y_i is at its lower bound, `<= 0` at
+    its upper one, else 0: one linear complementarity problem, and no square root.
 
     Args:
         coupling: Gbar (n, c), see `contact_coupling`.
         metric: P (n, n), symmetric positive definite.
         restitution: Lambda, a scalar or (n, n).
-        velocity: v- (n,), quasi-velocities [m/s times sqrt(kg)] (`to_quasi_velocities`).
+        velocity: v- (n,), quasi-velocities [m/s times sqrt(kg)]
+            (`to_quasi_velocities`).
         low: lower bounds of V, scalar or (c,); -inf for none.
         high: upper bounds.
 
@@ -90,17 +103,25 @@ def restitution_inclusion(
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.63)-(6.65).
 
     >>> import jimpact as ji
-    >>> out = ji.theory.restitution_inclusion([[1.0]], [[1.0]], 0.5, [-2.0])  # Newton's law
+    >>> out = ji.theory.restitution_inclusion(
+    ...     [[1.0]], [[1.0]], 0.5, [-2.0]
+    ... )  # Newton's law
     >>> float(out.velocity[0])
     1.0
     """
-    gbar, lam = as_numbers("coupling", coupling), as_numbers("restitution", restitution)
+    gbar = as_numbers("coupling", coupling)
+    lam = as_numbers("restitution", restitution)
     if gbar.ndim != 2:
-        raise ValueError(f"Argument `coupling` must be a matrix, but has shape {gbar.shape}.")
+        raise ValueError(
+            f"Argument `coupling` must be a matrix, but has shape {gbar.shape}."
+        )
     n, c = gbar.shape
     v = as_numbers("velocity", velocity, (n,), "one per row of `coupling`")
-    metric_p = as_numbers("metric", metric, (n, n), "square, one row per row of `coupling`")
-    lam = lam * jnp.eye(n, dtype=lam.dtype) if lam.ndim == 0 else lam
+    metric_p = as_numbers(
+        "metric", metric, (n, n), "square, one row per row of `coupling`"
+    )
+    if lam.ndim == 0:
+        lam = lam * jnp.eye(n, dtype=lam.dtype)
     check_shape("restitution", lam, (n, n), "or a scalar")
     low, high = (
         jnp.broadcast_to(as_float_array(name, x), (c,))
@@ -118,8 +139,8 @@ def _box_multipliers(
     """Multipliers p (c,) with `low <= y + S p <= high`, and the code of the status.
 
     Equation: `p = p_low - p_high`, `0 <= p_low _|_ y + S p - low >= 0`,
-    `0 <= p_high _|_ high - y - S p >= 0`: one LCP in (p_low, p_high) (2 c,). S (c, c) is symmetric
-    positive semidefinite.
+    `0 <= p_high _|_ high - y - S p >= 0`: one LCP in (p_low, p_high) (2 c,). S (c, c)
+    is symmetric positive semidefinite.
     """
     bounded = jnp.isfinite(jnp.concatenate([low, high]))
     slack = jnp.concatenate([y - low, high - y])
@@ -133,13 +154,15 @@ def _box_multipliers(
 
 
 class FrictionBounds(NamedTuple):
-    """Matrices and bounds of Prop. 6.6 and Theorem 6.2; `print(bounds)` says them in words.
+    """Matrices and bounds of Prop. 6.6 and Theorem 6.2; `print` says them in words.
 
-    `g_mu`, `k`, `m_bar` are the matrices G^mu, K and Mbar of (6.56) and (6.59) (all (m, m)).
-    Prop. 6.6 (1): `g_mu_bound` < 1 makes G^mu positive definite for every slip direction;
+    `g_mu`, `k`, `m_bar` are the matrices G^mu, K and Mbar of (6.56) and (6.59) (all (m,
+    m)). Prop. 6.6 (1): `g_mu_bound` < 1 makes G^mu positive definite for every slip
+    direction;
     (3), sharpened: `restitution_bound` < 1 makes Mbar positive definite.
-    Theorem 6.2 (i): `m_bar_least` > `k_largest`, both eigenvalues; (ii): |qn-| / |qt-| at least
-    `least_ratio`, which is infinite where (i) fails, and 0 where friction does not couple.
+    Theorem 6.2 (i): `m_bar_least` > `k_largest`, both eigenvalues; (ii): |qn-| / |qt-|
+    at least `least_ratio`, which is infinite where (i) fails, and 0 where friction does
+    not couple.
     """
 
     g_mu: np.ndarray
@@ -157,7 +180,9 @@ class FrictionBounds(NamedTuple):
         return self.m_bar_least > self.k_largest
 
     def dissipates(self, scene: Scene, velocity: Any) -> bool:
-        """True where Theorem 6.2 (sufficient) promises T+ <= T- of a scene at velocity v- (n,)."""
+        """True where Theorem 6.2 (sufficient) promises T+ <= T- of a scene at velocity
+        v- (n,).
+        """
         qn, qt = to_quasi_velocities(scene, velocity)
         return self.condition_i and bool(
             jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
@@ -166,12 +191,18 @@ class FrictionBounds(NamedTuple):
     def __str__(self) -> str:
         """Report: the four conditions with their numbers, a line each."""
         words = {True: "holds", False: "does not hold, which decides nothing"}
-        first, third = words[self.g_mu_bound < 1], words[self.restitution_bound < 1]
-        ratio = f"|qn-| / |qt-| >= {self.least_ratio:.6g}" if self.condition_i else "no bound"
+        first = words[self.g_mu_bound < 1]
+        third = words[self.restitution_bound < 1]
+        if self.condition_i:
+            ratio = f"|qn-| / |qt-| >= {self.least_ratio:.6g}"
+        else:
+            ratio = "no bound"
         return (
             f"Prop. 6.6 (1)    {self.g_mu_bound:.6g} < 1, so that G^mu > 0: {first}\n"
-            f"Prop. 6.6 (3)    {self.restitution_bound:.6g} < 1, so that Mbar > 0: {third}\n"
-            f"Theorem 6.2 (i)  lambda_min(Mbar) = {self.m_bar_least:.6g} > lambda_max(K) = "
+            f"Prop. 6.6 (3)    {self.restitution_bound:.6g} < 1, so that Mbar > 0: "
+            f"{third}\n"
+            f"Theorem 6.2 (i)  lambda_min(Mbar) = {self.m_bar_least:.6g} > "
+            f"lambda_max(K) = "
             f"{self.k_largest:.6g}: {words[self.condition_i]}\n"
             f"Theorem 6.2 (ii) energy surely decreases where: {ratio}"
         )
@@ -192,33 +223,39 @@ class _Coupling(NamedTuple):
 
 
 @full_precision
-def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -> FrictionBounds:
-    """Sufficient conditions for `qn+ = -E qn-` with `p_t = -[mubar][xi] pbar` to dissipate.
+def friction_bounds(
+    scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0
+) -> FrictionBounds:
+    """Conditions for `qn+ = -E qn-`, `p_t = -[mubar][xi] pbar` to dissipate.
 
-    Equation: `G^mu = G - n_q^T H_t [mubar][xi]`, `mubar_i = mu_i / |grad f_i|`, and the bounds
-    `|G^-1| |n_q^T H_t| |mubar| < 1`, `|E|^2 cond(G) < 1`,
+    Equation: `G^mu = G - n_q^T H_t [mubar][xi]`, `mubar_i = mu_i / |grad f_i|`, and the
+    bounds `|G^-1| |n_q^T H_t| |mubar| < 1`, `|E|^2 cond(G) < 1`,
     `lambda_min(Mbar) > lambda_max(K)`,
-    `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar| |(G^mu)^-1| |I + E| / (lambda_min - lambda_max)`,
-    where `Mbar = (I - E)^T G^-1 (I + E)` and `K = B^T B`, `B = t_q^T H_t [mubar][xi] (G^mu)^-1
-    (I + E)`. Spectral norms; eigenvalues of symmetric parts; [x] is the diagonal matrix of x, G the
-    normalized Delassus matrix, n_q and t_q the basis of `quasi_basis`, `pbar = |grad f| p`.
+    `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar| |(G^mu)^-1| |I + E| / (lambda_min -
+    lambda_max)`, where `Mbar = (I - E)^T G^-1 (I + E)` and `K = B^T B`, `B = t_q^T H_t
+    [mubar][xi] (G^mu)^-1
+    (I + E)`. Spectral norms; eigenvalues of symmetric parts; [x] is the diagonal matrix
+    of x, G the normalized Delassus matrix, n_q and t_q the basis of `quasi_basis`,
+    `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents H_t (n, m).
         matrix: E (m, m).
         friction: mu >= 0, scalar or (m,).
-        slip: xi in [-1, 1], scalar or (m,): the sign of sliding along H_t, inside it sticking.
+        slip: xi in [-1, 1], scalar or (m,): the sign of sliding along H_t, inside it
+            sticking.
 
     Returns:
         `FrictionBounds`; `print` says them in words.
 
     Raises:
-        ValueError: shapes, ranges; no tangents, spatial ones, an open contact, redundant ones;
-            friction so large that G^mu is singular.
+        ValueError: shapes, ranges; no tangents, spatial ones, an open contact,
+            redundant ones; friction so large that G^mu is singular.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.6 and Theorem 6.2, corrected: with
-    G^-1 in (6.58) the matrix M of (6.59) is G^-1 itself, which empties Prop. 6.6 (2), turns (3)
-    into that of Prop. 6.5, and (6.61)(ii) lacks the factor |(G^mu)^-1|.
+    Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.6 and Theorem 6.2, corrected:
+    with
+    G^-1 in (6.58) the matrix M of (6.59) is G^-1 itself, which empties Prop. 6.6 (2),
+    turns (3) into that of Prop. 6.5, and (6.61)(ii) lacks the factor |(G^mu)^-1|.
 
     >>> import jimpact as ji
     >>> particle = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
@@ -227,18 +264,26 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     """
     e = _restitution(scene, matrix)
     coupling = _coupling(scene, friction, slip)
-    mubar = as_float_array("friction", friction) * jnp.ones(scene.contacts) / kinetic_norm(scene)
+    mubar = (
+        as_float_array("friction", friction)
+        * jnp.ones(scene.contacts)
+        / kinetic_norm(scene)
+    )
     one_plus = np.eye(len(e)) + e  # I + E
-    g, g_mu = np.asarray(coupling.delassus, float), np.asarray(coupling.g_mu, float)
+    g = np.asarray(coupling.delassus, float)
+    g_mu = np.asarray(coupling.g_mu, float)
     if np.linalg.cond(g_mu) > 1 / (len(g) * np.finfo(scene.mass.dtype).eps):
         raise ValueError(
-            f"Argument `friction` must leave G^mu regular, but {np.asarray(friction)} makes it "
+            f"Argument `friction` must leave G^mu regular, but {np.asarray(friction)} "
+            f"makes it "
             "singular."
         )
     inverse = np.linalg.inv(g)
     m_bar = (np.eye(len(e)) - e).T @ inverse @ one_plus
     # t_q^T H_t [mubar][xi]
-    slide = np.asarray(coupling.tangential, float) * np.asarray(coupling.friction)[None, :]
+    slide = (
+        np.asarray(coupling.tangential, float) * np.asarray(coupling.friction)[None, :]
+    )
     b = slide @ np.linalg.solve(g_mu, one_plus)
     k = b.T @ b
     least = float(np.linalg.eigvalsh(0.5 * (m_bar + m_bar.T))[0])
@@ -263,11 +308,11 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
 def friction_impulses(
     scene: Scene, matrix: Any, friction: Any, slip: Any, velocity: Any
 ) -> tuple[jax.Array, jax.Array]:
-    """Normal impulses p (m,) and tangential p_t (m,) [N s] of the law for a given slip xi.
+    """Normal and tangential impulses p, p_t (m,) [N s] of the law for a slip xi.
 
-    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`,
-    with G^mu and mubar of `friction_bounds`. The slip is taken as given: whether it agrees with
-    the sliding after it is the caller's.
+    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`,
+    `p = pbar / |grad f|`, with G^mu and mubar of `friction_bounds`. The slip is taken
+    as given: whether it agrees with the sliding after it is the caller's.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents.
@@ -303,8 +348,9 @@ def friction_energy_change(
 ) -> jax.Array:
     """`T+ - T-` [J] of normal and tangential impulses, in kinetic quasi-velocities.
 
-    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t p_t / 2`,
-    with `pbar = |grad f| p`, H_t the tangents, and G, n_q, t_q as in `friction_bounds`.
+    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t
+    p_t / 2`, with `pbar = |grad f|
+    p`, H_t the tangents, and G, n_q, t_q as in `friction_bounds`.
 
     Args:
         scene: m contacts, planar tangents.
@@ -328,7 +374,10 @@ def friction_energy_change(
     coupling = _coupling(scene, 0.0, 0.0)
     p, p_t = (
         as_numbers(name, value, (scene.contacts,), "one per contact")
-        for name, value in (("impulse", impulse), ("tangential_impulse", tangential_impulse))
+        for name, value in (
+            ("impulse", impulse),
+            ("tangential_impulse", tangential_impulse),
+        )
     )
     qn, qt = to_quasi_velocities(scene, velocity)
     pbar = kinetic_norm(scene) * p
@@ -340,24 +389,33 @@ def friction_energy_change(
 
 def _norm(matrix: jax.Array | np.ndarray) -> float:
     """Largest singular value; 0 of an empty matrix."""
-    return float(np.linalg.norm(np.asarray(matrix, float), 2)) if np.size(matrix) else 0.0
+    if np.size(matrix):
+        return float(np.linalg.norm(np.asarray(matrix, float), 2))
+    return 0.0
 
 
 def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
     """Restitution matrix E (m, m) as a NumPy array, checked."""
-    e = as_numbers("matrix", matrix, (scene.contacts,) * 2, "one row and one column per contact")
+    e = as_numbers(
+        "matrix", matrix, (scene.contacts,) * 2, "one row and one column per contact"
+    )
     return np.asarray(e, float)
 
 
 def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
-    """Matrices of a planar scene of closed contacts with friction mu at slip xi, checked."""
+    """Matrices of a planar scene of closed contacts with friction mu at slip xi,
+    checked.
+    """
     m = scene.contacts
     if scene.tangents is None or scene.tangents.shape[1] != m:
         raise ValueError(
-            f"Argument `scene` must have planar tangents, one column for each of its {m} contacts."
+            f"Argument `scene` must have planar tangents, one column for each of its "
+            f"{m} contacts."
         )
     if not bool(np.all(scene.closed)):
-        raise ValueError("Argument `scene` must have closed contacts only: leave open ones out.")
+        raise ValueError(
+            "Argument `scene` must have closed contacts only: leave open ones out."
+        )
     mu = as_numbers("friction", friction, contacts=m, low=0.0)
     xi = as_numbers("slip", slip, contacts=m, low=-1.0, high=1.0)
     _, tangent = quasi_basis(scene)

@@ -15,13 +15,18 @@ from jimpact.laws.gap_scale import gap_scale as gap_scale
 from jimpact.tools.checks import as_float_array, as_numbers, check_shape
 from jimpact.tools.status import STATUS
 
-# Linearized over sampled standard deviation, less 1, up to which the outcome is called linear.
+# Linearized over sampled standard deviation, less 1, up to which the outcome is called
+# linear.
 AGREES = 0.2
-CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
+# a standard deviation below this, relative to the velocities, is rounding
+CONSTANT = 1e-12
 
 
 class Crossover(eqx.Module):
-    """`velocity` (s, n) [m/s] and `status` (s,) over `offset` (s,), gap 1 - gap 2 over delta_c."""
+    """`velocity` (s, n) [m/s] and `status` (s,) over `offset` (s,).
+
+    The offset is (gap 1 - gap 2) / delta_c.
+    """
 
     offset: jax.Array
     velocity: jax.Array
@@ -31,51 +36,66 @@ class Crossover(eqx.Module):
 def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
     """Outcome of a two-contact scene against the difference of its gaps.
 
-    The outcome depends on which contact closes first. Laws of instantaneous collisions jump where
-    both close at once. With indentation the jump is a smooth crossover, about 2 delta_c wide.
+    The outcome depends on which contact closes first. Laws of instantaneous collisions
+    jump where both close at once. With indentation the jump is a smooth crossover,
+    about 2 delta_c wide.
 
     Args:
-        scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
+        scene: with two contacts; the mean of its gaps (none: closed) is widened as
+            needed.
         law: a `Compliant`, or another one with a `contact_force` that uses gaps.
         velocity: v- (n,) [m/s].
-        offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
+        offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of
+            the two.
 
     Returns:
-        `Crossover`: `velocity` (s, n) [m/s] and `status` (s,), one row for each `offset` (s,).
+        `Crossover`: `velocity` (s, n) [m/s] and `status` (s,), one row for each
+            `offset` (s,).
 
     Raises:
         ValueError: not two contacts, offsets of another shape. TypeError: another law.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.1.1: balls of mass (m/4, m, m/4).
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.1.1: balls of mass (m/4,
+    m, m/4).
 
     >>> import jimpact as ji
     >>> balls = ji.chain([0.25, 1.0, 0.25])
     >>> law = ji.Compliant(ji.Hertz(1.0))
     >>> result = ji.theory.crossover(balls, law, [1.0, 0.0, -1.0], [-9.0, 0.0, 9.0])
-    >>> (result.velocity.round(4) + 0.0).tolist()  # one by one, both at once, the mirror image
+    >>> (
+    ...     result.velocity.round(4) + 0.0
+    ... ).tolist()  # one by one, both at once, the mirror image
     [[-0.6, -0.16, 1.24], [-1.0, 0.0, 1.0], [-1.24, 0.16, 0.6]]
     """
     if scene.contacts != 2:
-        raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
+        raise ValueError(
+            f"Argument `scene` must have two contacts, but has {scene.contacts}."
+        )
     if not law.uses_gaps or law.contact_force is None:
         raise TypeError(
-            f"Argument `law` must use gaps and have a `contact_force` (Compliant), but is {law!r}."
+            f"Argument `law` must use gaps and have a `contact_force` (Compliant), but "
+            f"is {law!r}."
         )
     s = as_numbers("offset", offset)
     if s.ndim != 1:
-        raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
+        raise ValueError(
+            f"Argument `offset` must have shape (s,), but has shape {s.shape}."
+        )
     scale = gap_scale(scene, law, velocity)
     delta = jnp.max(scale.delta)
     # gaps (s, 2) = mean +- delta s / 2, the mean large enough for gaps >= 0
     mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
     gaps = mean + 0.5 * delta * s[:, None] * jnp.array([1.0, -1.0], s.dtype)[None, :]
-    v, gaps = as_float_array("velocity", velocity), jnp.maximum(gaps, 0.0)
+    v = as_float_array("velocity", velocity)
+    gaps = jnp.maximum(gaps, 0.0)
     out = jax.vmap(lambda each: impact(law, with_gaps(scene, each), v))(gaps)
     return Crossover(s, out.velocity, out.status)
 
 
 class SampledGaps(Protocol):
-    """A result of `ji.monte_carlo`: covariance of its gaps, and statistics of v+ (n,)."""
+    """A result of `ji.monte_carlo`: covariance of its gaps, and statistics of v+
+    (n,).
+    """
 
     @property
     def gap_covariance(self) -> np.ndarray:
@@ -96,10 +116,11 @@ class SampledGaps(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GapSensitivity:
-    """The outcome at given gaps (m,) [m] and its derivatives in them; `print` gives a report.
+    """The outcome at given gaps (m,) [m] and its derivatives in them.
 
     Attributes:
-        gaps, velocity: (m,) [m], where it is linearized, and (n,) [m/s], the outcome there.
+        gaps, velocity: (m,) [m], where it is linearized, and (n,) [m/s], the outcome
+            there.
         jacobian: (n, m) [1/s], `d v+_i / d gap_j`.
         status: name of the impact's status.
         sampled: the Monte Carlo run to compare with, or None.
@@ -112,34 +133,49 @@ class GapSensitivity:
     sampled: SampledGaps | None = None
 
     def covariance(self, gap_covariance: Any) -> np.ndarray:
-        """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma = `gap_covariance`."""
-        sigma, shape = np.asarray(gap_covariance, float), (len(self.gaps),) * 2
+        """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma =
+        `gap_covariance`.
+        """
+        sigma = np.asarray(gap_covariance, float)
+        shape = (len(self.gaps),) * 2
         check_shape("gap_covariance", sigma, shape, "a row and a column per contact")
         return self.jacobian @ sigma @ self.jacobian.T
 
     @property
     def explained(self) -> np.ndarray:
-        """Linearized over sampled standard deviation (n,): 1 where the linearization holds."""
+        """Linearized over sampled standard deviation (n,): 1 where the linearization
+        holds.
+        """
         if self.sampled is None:
-            raise ValueError("Argument `sampled` must be given for a comparison, but is None.")
+            raise ValueError(
+                "Argument `sampled` must be given for a comparison, but is None."
+            )
         linear = np.sqrt(np.diag(self.covariance(self.sampled.gap_covariance)))
         with np.errstate(divide="ignore", invalid="ignore"):
             return linear / self.sampled.std
 
     def __str__(self) -> str:
-        """Report: v+ and its Jacobian in the gaps and, if sampled, the standard deviations."""
+        """Report: v+ and its Jacobian in the gaps and, if sampled, the standard
+        deviations.
+        """
         at = ", ".join(f"{gap:g}" for gap in self.gaps)
-        lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]
+        lines = [
+            f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"
+        ]
         for i, (v, row) in enumerate(zip(self.velocity, self.jacobian)):
             numbers = "".join(f"{x:13.5g}" for x in row)
             lines.append(f"v{i + 1}+ = {v:10.6f} m/s: {numbers}")
         return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
 
     def _comparison(self) -> list[str]:
-        """Report lines: linearized against sampled standard deviations [m/s], and a verdict."""
+        """Report lines: linearized against sampled standard deviations [m/s], and a
+        verdict.
+        """
         assert self.sampled is not None
         ratio = self.explained
-        largest = np.max(np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0)
+        largest = np.max(
+            np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0
+        )
         if np.all(self.sampled.std <= CONSTANT * largest):
             return ["The outcome does not depend on the gaps."]
         lines = ["standard deviations [m/s], linearized against sampled:"]
@@ -149,12 +185,14 @@ class GapSensitivity:
             lines.append("The outcome is nearly linear over the spread of the gaps.")
         elif not self.jacobian.any():
             lines.append(
-                "The outcome does not change with small changes of the gaps, yet it varies: it "
+                "The outcome does not change with small changes of the gaps, yet it "
+                "varies: it "
                 "jumps where the order of the collisions changes. Trust the samples."
             )
         else:
             lines.append(
-                "The linearization fails over this spread: the gaps reach across a crossover or a "
+                "The linearization fails over this spread: the gaps reach across a "
+                "crossover or a "
                 "curved part. Trust the samples."
             )
         return lines
@@ -163,12 +201,12 @@ class GapSensitivity:
 def gap_sensitivity(
     law: Law, scene: Scene, velocity: Any, gaps: Any, sampled: SampledGaps | None = None
 ) -> GapSensitivity:
-    """Jacobian of the outcome in the gaps, and the linearized covariance next to Monte Carlo's.
+    """Jacobian of the outcome in the gaps, and the linearized covariance.
 
-    Equation: `J = d v+ / d gap`, `cov(v+) ~ J Sigma J^T`. It holds where the outcome is nearly
-    linear over the spread of the gaps, so not across a crossover of the order of contacts; for
-    laws that see gaps only in the order of collisions (Binary) J = 0, for laws that ignore the
-    sizes of gaps too.
+    Equation: `J = d v+ / d gap`, `cov(v+) ~ J Sigma J^T`. It holds where the outcome is
+    nearly linear over the spread of the gaps, so not across a crossover of the order of
+    contacts; for laws that see gaps only in the order of collisions (Binary) J = 0, for
+    laws that ignore the sizes of gaps too.
 
     Args:
         law: as in `impact`.
@@ -195,7 +233,9 @@ def gap_sensitivity(
     v = as_float_array("velocity", velocity)
 
     def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
-        """v+ (n,) [m/s] at gaps (m,) [m], to be differentiated; v+ and status as they are."""
+        """v+ (n,) [m/s] at gaps (m,) [m], to be differentiated; v+ and status as they
+        are.
+        """
         out = impact(law, with_gaps(scene, gaps), v)
         return out.velocity, (out.velocity, out.status)
 

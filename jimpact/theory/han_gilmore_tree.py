@@ -10,21 +10,24 @@ import numpy as np
 from jimpact.core.scene import Scene, as_velocity, dense_mass
 from jimpact.tools.checks import as_whole, check_per_contact, check_values, is_traced
 
-# Relative to the largest normalized approach velocity at the start: smaller gap velocities and
-# impulses are zero, velocities that differ by less are the same. Ten times more would merge
-# branches that differ in the eighth digit.
+# Relative to the largest normalized approach velocity at the start: smaller gap
+# velocities and impulses are zero, velocities that differ by less are the same. Ten
+# times more would merge branches that differ in the eighth digit.
 ZERO = 1e-9
 SINGULAR = 1e-14  # singular values of G_SS below this are zero: redundant contacts
-# An approach left at the end, relative as ZERO, that is no rounding: the sequence of impacts has no
-# end. Ten times more would begin to hide sequences whose approaches fall a hundredfold at once.
+# An approach left at the end, relative as ZERO, that is no rounding: the sequence of
+# impacts has no end. Ten times more would begin to hide sequences whose approaches fall
+# a hundredfold at once.
 ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
 class HanGilmoreOutcome:
-    """v+ (n,) [m/s], impulses p (m,) and p_t (t,) [N s], the outcome of rule (iii) at each impact.
+    """v+ (n,) [m/s], impulses p (m,) and p_t (t,) [N s], the outcome of rule (iii) at
+    each impact.
 
-    `endless`: a sequence of impacts without end leads there, cut off at 1e-9 of the approach.
+    `endless`: a sequence of impacts without end leads there, cut off at 1e-9 of the
+    approach.
     """
 
     velocity: np.ndarray
@@ -36,7 +39,9 @@ class HanGilmoreOutcome:
 
 @dataclasses.dataclass
 class _Node:
-    """A velocity that the tree has reached, in normalized components along normals and tangents."""
+    """A velocity that the tree has reached, in normalized components along normals and
+    tangents.
+    """
 
     state: np.ndarray  # gap and slip velocities (m + t,) over sqrt(W_jj)
     p: np.ndarray  # sum of the impulses (m + t,) from the start, times sqrt(W_jj)
@@ -46,7 +51,9 @@ class _Node:
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """Contact matrices of a scene with m contacts and t tangents (0, or m with friction)."""
+    """Contact matrices of a scene with m contacts and t tangents (0, or m with
+    friction).
+    """
 
     matrix: np.ndarray  # W_ij / sqrt(W_ii W_jj) of normals and tangents (m + t, m + t)
     restitution: np.ndarray  # e (m,)
@@ -63,15 +70,20 @@ class _Problem:
 
     @property
     def coupled(self) -> np.ndarray:
-        """Mask (m, m): an impulse at contact j changes a gap or slip velocity at contact i."""
-        m, each = self.contacts, len(self.matrix) // self.contacts
+        """Mask (m, m): an impulse at contact j changes a gap or slip velocity at
+        contact i.
+        """
+        m = self.contacts
+        each = len(self.matrix) // self.contacts
         # axes: normal or tangent, contact; once for rows and once for columns
         blocks = np.abs(self.matrix).reshape(each, m, each, m)
         coupled: np.ndarray = blocks.max(axis=(0, 2)) > SINGULAR
         return coupled
 
     def approach(self, node: _Node) -> float:
-        """Largest normalized approach velocity -qn of a closed contact, 0 where none approaches."""
+        """Largest normalized approach velocity -qn of a closed contact, 0 where none
+        approaches.
+        """
         return float(np.max(-node.state[: self.contacts][self.closed], initial=0.0))
 
 
@@ -80,10 +92,12 @@ Cells = dict[int, list[np.ndarray]]
 
 
 def _is_new(state: np.ndarray, visited: Cells) -> bool:
-    """True for a state that differs by more than `ZERO` from all visited ones; it becomes visited.
+    """True for a state that differs by more than `ZERO` from all visited ones; it
+    becomes visited.
 
-    States are kept in cells of their weighted sum `sum_i w_i s_i`, `2 ZERO sum_i w_i` wide: equal
-    states lie in the same cell or in neighbours, so that few have to be compared.
+    States are kept in cells of their weighted sum `sum_i w_i s_i`, `2 ZERO sum_i w_i`
+    wide: equal states lie in the same cell or in neighbours, so that few have to be
+    compared.
     """
     weights = np.sqrt(np.arange(2.0, len(state) + 2))
     cell = int(np.floor(state @ weights / (2 * ZERO * weights.sum())))
@@ -105,34 +119,39 @@ def han_gilmore(
     """All outcomes of an impact by the rules of Han and Gilmore; a host function.
 
     Equation: at each impact of a branch, S is the set of contacts with p_j > 0; there
-    `gamma_S+ = -e gamma_S`, without friction `p_S = -W_SS^-1 (1 + e) gamma_S`. Rules: (i) energy
-    is conserved, where e = 1; (ii) a branch ends where `gamma+ >= 0`, else another impact follows;
-    (iii) `p_j > 0` where `gamma_j < 0`, `p_j = 0` where `gamma_j > 0`, both are tried where
-    `gamma_j = 0` (to 1e-9 of the largest approach). With friction each contact of S also sticks,
-    `u+ = 0` and `|p_t| <= mu p`, or slides to either side, `p_t = -mu p sgn(u+)`: all are tried.
+    `gamma_S+ = -e gamma_S`, without friction `p_S = -W_SS^-1 (1 + e) gamma_S`. Rules:
+    (i) energy is conserved, where e = 1; (ii) a branch ends where `gamma+ >= 0`, else
+    another impact follows; (iii) `p_j > 0` where `gamma_j < 0`, `p_j = 0` where
+    `gamma_j > 0`, both are tried where `gamma_j = 0` (to 1e-9 of the largest approach).
+    With friction each contact of S also sticks, `u+ = 0` and `|p_t| <= mu p`, or slides
+    to either side, `p_t = -mu p sgn(u+)`: all are tried.
 
     Args:
-        scene: its open contacts (gap > 0) take no part; planar tangents where there is friction.
+        scene: its open contacts (gap > 0) take no part; planar tangents where there is
+            friction.
         velocity: v- (n,) [m/s].
         restitution: kinematic coefficient e in [0, 1], scalar or (m,).
         friction: Coulomb's mu >= 0, scalar or (m,); None: no friction.
-        max_depth: longest branch, in impacts. The tree grows exponentially with the contacts at
-            rest: one of eight equal balls hits the others, 1894 outcomes, a second.
+        max_depth: longest branch, in impacts. The tree grows exponentially with the
+            contacts at rest: one of eight equal balls hits the others, 1894 outcomes, a
+            second.
 
     Returns:
-        The distinct outcomes in float64, the shortest branches first (`velocity`, `impulse`,
-        `tangential_impulse`, `rules`: one text an impact, contacts counted from 0; the branch of
-        fewest impacts where several lead to the same v+). `endless` where one of these branches
-        has no end: its approaches decay, as with e = 0, and it is cut off at 1e-9. Empty where the
-        rules contradict each other (an approaching contact would have to pull) or bounce between
-        the same velocities for ever. For redundant contacts the impulse is the one of least norm.
+        The distinct outcomes in float64, the shortest branches first (`velocity`,
+        `impulse`,
+        `tangential_impulse`, `rules`: one text an impact, contacts counted from 0; the
+        branch of fewest impacts where several lead to the same v+). `endless` where one
+        of these branches has no end: its approaches decay, as with e = 0, and it is cut
+        off at 1e-9. Empty where the rules contradict each other (an approaching contact
+        would have to pull) or bounce between the same velocities for ever. For
+        redundant contacts the impulse is the one of least norm.
 
     Raises:
         ValueError, TypeError: bad input, traced values.
         RuntimeError: a branch is longer than `max_depth`.
 
-    Source: Han and Gilmore, J. Mech. Design 115 (1993) 412; Brogliato, Nonsmooth Mechanics
-    (2016), (6.9)-(6.12).
+    Source: Han and Gilmore, J. Mech. Design 115 (1993) 412; Brogliato, Nonsmooth
+    Mechanics (2016), (6.9)-(6.12).
 
     >>> import jimpact as ji
     >>> for outcome in ji.han_gilmore(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]):
@@ -141,18 +160,24 @@ def han_gilmore(
     [0. 0. 1.] 2
     """
     if is_traced((scene, velocity)):
-        raise TypeError("`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad).")
+        raise TypeError(
+            "`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad)."
+        )
     check_values("velocity", as_velocity(scene, velocity))
     as_whole("max_depth", max_depth, 1)
-    v, problem = np.asarray(velocity, float), _problem(scene, restitution, friction)
-    m, state = problem.contacts, problem.rows.T @ v / problem.root
+    v = np.asarray(velocity, float)
+    problem = _problem(scene, restitution, friction)
+    m = problem.contacts
+    state = problem.rows.T @ v / problem.root
     start = _Node(state, np.zeros_like(state))
     size = problem.approach(start)
     if size == 0.0:
         return [HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])]
     start.state = state / size
     found: list[_Node] = []  # ends of branches: nothing approaches
-    frontier, visited = [start], Cells()  # nodes after equally many impacts, and all so far
+    # nodes after equally many impacts, and all so far
+    frontier = [start]
+    visited = Cells()
     _is_new(start.state, visited)
     while frontier:
         following: list[_Node] = []
@@ -161,7 +186,8 @@ def han_gilmore(
                 approach = problem.approach(child)
                 if _is_new(child.state, visited):
                     (found if approach <= ZERO else following).append(child)
-                # such an approach decays through a sequence of impacts without end, cut off here
+                # such an approach decays through a sequence of impacts without end, cut
+                # off here
                 if ROUNDING < approach <= ZERO:
                     for other in found:
                         near = np.abs(other.state - child.state).max() <= 2 * ZERO
@@ -176,26 +202,31 @@ def han_gilmore(
     for node in found:
         p = node.p * size / problem.root
         after = v + problem.mobility @ p
-        outcomes.append(HanGilmoreOutcome(after, p[:m], node.rules, p[m:], node.endless))
+        outcomes.append(
+            HanGilmoreOutcome(after, p[:m], node.rules, p[m:], node.endless)
+        )
     return outcomes
 
 
 def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
     """Contact matrices of a scene, in double precision always, with e and mu checked.
 
-    `W = J M^-1 J^T`, J^T (n, m + t) the normals and, with friction, the tangents. Single precision
-    could not tell contacts at rest from slow ones, which decides the tree.
+    `W = J M^-1 J^T`, J^T (n, m + t) the normals and, with friction, the tangents.
+    Single precision could not tell contacts at rest from slow ones, which decides the
+    tree.
     """
     m = scene.contacts
     check_per_contact("restitution", restitution, m)
     check_values("restitution", restitution, low=0.0, high=1.0)
-    rows, mu = np.asarray(scene.normals, float), None
+    rows = np.asarray(scene.normals, float)
+    mu = None
     if friction is not None:
         check_per_contact("friction", friction, m)
         check_values("friction", friction, low=0.0)
         if scene.tangents is None or scene.tangents.shape[1] != m:
             raise ValueError(
-                "Argument `scene` must have one tangent a contact (planar) where there is friction."
+                "Argument `scene` must have one tangent a contact (planar) where there "
+                "is friction."
             )
         rows = np.concatenate([rows, np.asarray(scene.tangents, float)], axis=1)
         mu = np.broadcast_to(np.asarray(friction, float), (m,))
@@ -213,16 +244,19 @@ def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
 
 
 def _impacts(problem: _Problem, node: _Node) -> Iterator[_Node]:
-    """Nodes after one more impact: one for each set of contacts with p > 0 that rule (iii) allows.
+    """Nodes after one more impact: one for each set of contacts with p > 0 that rule
+    (iii) allows.
 
     With friction one for each way in which these contacts stick or slide, too.
     """
-    qn, closed = node.state[: problem.contacts], problem.closed
+    qn = node.state[: problem.contacts]
+    closed = problem.closed
     approaching = closed & (qn < -ZERO)
     resting = closed & (np.abs(qn) <= ZERO)
     for active in _active_sets(problem.coupled, approaching, resting):
         at = np.flatnonzero(active)
-        signs = (0, 1, -1) if problem.friction is not None else (0,)  # of u+; 0: it sticks
+        # of u+; 0: it sticks
+        signs = (0, 1, -1) if problem.friction is not None else (0,)
         for slides in itertools.product(signs, repeat=len(at)):
             child = _impact(problem, node, at, np.array(slides))
             if child is None:
@@ -234,25 +268,36 @@ def _impacts(problem: _Problem, node: _Node) -> Iterator[_Node]:
             yield dataclasses.replace(child, rules=(*node.rules, rule))
 
 
-def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) -> _Node | None:
-    """The node after an impact with p > 0 at contacts `at` (s,); None if it contradicts itself.
+def _impact(
+    problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray
+) -> _Node | None:
+    """The node after an impact with p > 0 at contacts `at` (s,); None if it contradicts
+    itself.
 
-    Equation: `gamma+ = -e gamma-`; with friction `u+ = 0` where `slides` (s,) is 0, else
-    `p_t = -mu p slides`. It contradicts itself unless p > 0, |p_t| <= mu p where a contact sticks,
-    and u+ has the sign `slides`.
+    Equation: `gamma+ = -e gamma-`; with friction `u+ = 0` where `slides` (s,) is 0,
+    else
+    `p_t = -mu p slides`. It contradicts itself unless p > 0, |p_t| <= mu p where a
+    contact sticks, and u+ has the sign `slides`.
     """
-    m, count, mu = problem.contacts, len(at), problem.friction
-    rows = at if mu is None else np.concatenate([at, m + at])
+    m = problem.contacts
+    count = len(at)
+    mu = problem.friction
+    if mu is None:
+        rows = at
+    else:
+        rows = np.concatenate([at, m + at])
     # block (p, p_t) = target: changes of gap and slip velocity
     block = problem.matrix[np.ix_(rows, rows)].copy()
     target = -node.state[rows]
     target[:count] *= 1 + problem.restitution[at]
     if mu is not None:
         for k in np.flatnonzero(slides):  # p_t + mu p sgn(u+) = 0
-            block[count + k], target[count + k] = 0.0, 0.0
+            block[count + k] = 0.0
+            target[count + k] = 0.0
             block[count + k, [k, count + k]] = mu[at[k]] * slides[k], 1.0
     solved = np.linalg.lstsq(block, target, rcond=SINGULAR)[0]
-    pushes, p_t = solved[:count], solved[count:]
+    pushes = solved[:count]
+    p_t = solved[count:]
     if np.abs(block @ solved - target).max() > ZERO or np.any(pushes <= ZERO):
         return None
     p = np.zeros_like(node.p)
@@ -270,12 +315,14 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
 def _active_sets(
     coupled: np.ndarray, approaching: np.ndarray, resting: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Masks (m,) of contacts with p > 0: the approaching ones, alone and with resting ones.
+    """Masks (m,) of contacts with p > 0: the approaching ones, alone and with resting
+    ones.
 
-    `coupled` (m, m), `approaching` and `resting` (m,) are masks. A resting contact joins a set only
-    where it is coupled to a contact of the set; else p_j = 0.
+    `coupled` (m, m), `approaching` and `resting` (m,) are masks. A resting contact
+    joins a set only where it is coupled to a contact of the set; else p_j = 0.
     """
-    sets, known = [approaching], {approaching.tobytes()}
+    sets = [approaching]
+    known = {approaching.tobytes()}
     for active in sets:
         yield active
         for j in np.flatnonzero(resting & ~active & coupled[active].any(axis=0)):
@@ -289,11 +336,14 @@ def _active_sets(
 def _rule(
     closed: np.ndarray, active: np.ndarray, approaching: np.ndarray, resting: np.ndarray
 ) -> str:
-    """Text of rule (iii) at one impact: closed contacts with p > 0 and with p = 0, and why.
+    """Text of rule (iii) at one impact: closed contacts with p > 0 and with p = 0, and
+    why.
 
     All arguments are masks (m,).
     """
-    why = np.where(approaching, "approaching", np.where(resting, "at rest", "separating"))
+    why = np.where(
+        approaching, "approaching", np.where(resting, "at rest", "separating")
+    )
     cases = (("p > 0", active), ("p = 0", closed & ~active))
     texts = [
         f"{case} at " + ", ".join(f"{j} ({why[j]})" for j in np.flatnonzero(chosen))

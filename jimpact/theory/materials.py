@@ -26,7 +26,7 @@ def hertz_stiffness(
     poisson2: Any = None,
     radius2: Any = None,
 ) -> jax.Array:
-    """Stiffness k of `F = k x^1.5` between two elastic spheres, or a sphere and a plane.
+    """Stiffness k of `F = k x^1.5` of two elastic spheres, or sphere and plane.
 
     Equation: `k = (4/3) E* sqrt(R*)`, `1/E* = (1 - nu1^2)/E1 + (1 - nu2^2)/E2`,
     `1/R* = 1/R1 + 1/R2`.
@@ -40,7 +40,8 @@ def hertz_stiffness(
         radius2: R2 [m]; None: an equal sphere; `inf`: a plane.
 
     Returns:
-        k [N / m^1.5], of the common shape. Valid for x much smaller than R and no plastic flow.
+        k [N / m^1.5], of the common shape. Valid for x much smaller than R and no
+        plastic flow.
 
     Raises:
         ValueError: modulus or radius not positive, Poisson ratio out of range.
@@ -57,15 +58,30 @@ def hertz_stiffness(
     """
     e1, nu1, r1 = (
         as_float_array(name, value)
-        for name, value in (("modulus", modulus), ("poisson", poisson), ("radius", radius))
+        for name, value in (
+            ("modulus", modulus),
+            ("poisson", poisson),
+            ("radius", radius),
+        )
     )
-    e2 = e1 if modulus2 is None else as_float_array("modulus2", modulus2)
-    nu2 = nu1 if poisson2 is None else as_float_array("poisson2", poisson2)
-    r2 = r1 if radius2 is None else as_float_array("radius2", radius2)
+    if modulus2 is None:
+        e2 = e1
+    else:
+        e2 = as_float_array("modulus2", modulus2)
+    if poisson2 is None:
+        nu2 = nu1
+    else:
+        nu2 = as_float_array("poisson2", poisson2)
+    if radius2 is None:
+        r2 = r1
+    else:
+        r2 = as_float_array("radius2", radius2)
     for name, value in (("modulus", e1), ("radius", r1)):
         check_values(name, value, low=0.0, open_low=True)
     for name, value in (("modulus2", e2), ("radius2", r2)):  # infinite: rigid, plane
-        check_values(name, jnp.minimum(value, jnp.finfo(value.dtype).max), low=0.0, open_low=True)
+        check_values(
+            name, jnp.minimum(value, jnp.finfo(value.dtype).max), low=0.0, open_low=True
+        )
     for name, value in (("poisson", nu1), ("poisson2", nu2)):
         check_values(name, value, low=-1.0, high=0.5)
     compliance = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
@@ -78,10 +94,10 @@ def mindlin_ratio(
 ) -> jax.Array:
     """Ratio kappa of tangential to normal stiffness of two spheres, before any slip.
 
-    Equation: `kappa = 2 (1 - nu) / (2 - nu)` of one material, 2/3 to 1 for nu from 1/2 to 0. Of
-    two, `kappa = 4 G* / E*`, `1/E* = (1 - nu1^2)/E1 + (1 - nu2^2)/E2`,
-    `1/G* = 2 (1 + nu1) (2 - nu1)/E1 + 2 (1 + nu2) (2 - nu2)/E2`: the `tangential_stiffness` of
-    `LZB` and `Compliant`.
+    Equation: `kappa = 2 (1 - nu) / (2 - nu)` of one material, 2/3 to 1 for nu from 1/2
+    to 0. Of two, `kappa = 4 G* / E*`, `1/E* = (1 - nu1^2)/E1 + (1 - nu2^2)/E2`,
+    `1/G* = 2 (1 + nu1) (2 - nu1)/E1 + 2 (1 + nu2) (2 -
+    nu2)/E2`: the `tangential_stiffness` of `LZB` and `Compliant`.
 
     Args:
         poisson: Poisson ratio nu1 in [-1, 0.5].
@@ -93,19 +109,25 @@ def mindlin_ratio(
         kappa, of the common shape.
 
     Raises:
-        ValueError: Poisson ratio out of range, a modulus not positive, or one of the two without
-            the other.
+        ValueError: Poisson ratio out of range, a modulus not positive, or one of the
+            two without the other.
 
-    Source: Mindlin, J. Appl. Mech. 16 (1949) 259; Johnson, Contact Mechanics (1985), 7.2.
+    Source: Mindlin, J. Appl. Mech. 16 (1949) 259; Johnson, Contact Mechanics (1985),
+    7.2.
 
     >>> import jimpact as ji
     >>> round(float(ji.theory.mindlin_ratio(0.3)), 4)  # steel
     0.8235
-    >>> round(float(ji.theory.mindlin_ratio(0.25, 70e9, 0.3, 210e9)), 4)  # glass on steel
+    >>> round(
+    ...     float(ji.theory.mindlin_ratio(0.25, 70e9, 0.3, 210e9)), 4
+    ... )  # glass on steel
     0.8487
     """
     nu1 = as_float_array("poisson", poisson)
-    nu2 = nu1 if poisson2 is None else as_float_array("poisson2", poisson2)
+    if poisson2 is None:
+        nu2 = nu1
+    else:
+        nu2 = as_float_array("poisson2", poisson2)
     for name, nu in (("poisson", nu1), ("poisson2", nu2)):
         check_values(name, nu, low=-1.0, high=0.5)
     given = {"modulus": modulus, "modulus2": modulus2, "poisson2": poisson2}
@@ -115,9 +137,14 @@ def mindlin_ratio(
     if "modulus" in missing:
         raise ValueError("Argument `modulus` must be given with another material.")
     e1 = as_float_array("modulus", modulus)
-    e2 = e1 if modulus2 is None else as_float_array("modulus2", modulus2)
+    if modulus2 is None:
+        e2 = e1
+    else:
+        e2 = as_float_array("modulus2", modulus2)
     check_values("modulus", e1, low=0.0, open_low=True)
-    check_values("modulus2", jnp.minimum(e2, jnp.finfo(e2.dtype).max), low=0.0, open_low=True)
+    check_values(
+        "modulus2", jnp.minimum(e2, jnp.finfo(e2.dtype).max), low=0.0, open_low=True
+    )
     normal = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
     tangential = (1 + nu1) * (2 - nu1) / e1 + (1 + nu2) * (2 - nu2) / e2
     return 2 * normal / tangential
@@ -128,11 +155,12 @@ def pair_restitution(
 ) -> jax.Array:
     """Restitution e of a contact from those of its two materials.
 
-    Equation: rule 'energy' is `e^2 = (e1^2 / k1 + e2^2 / k2) / (1 / k1 + 1 / k2)`. The bodies are
-    in series: at the same force F a deformation `x_i` proportional to `1 / k_i` gives body i the
-    share `(1 / k_i) / (1 / k1 + 1 / k2)` of the energy of compression, of which it returns `e_i^2`.
-    So a soft body decides, and equal bodies keep their e. The other rules are those of physics
-    engines, and have no derivation: 'product', 'mean', 'geometric_mean', 'minimum', 'maximum'.
+    Equation: rule 'energy' is `e^2 = (e1^2 / k1 + e2^2 / k2) / (1 / k1 + 1 / k2)`. The
+    bodies are in series: at the same force F a deformation `x_i` proportional to
+    `1 / k_i` gives body i the share `(1 / k_i) / (1 / k1 + 1 / k2)` of the energy of
+    compression, of which it returns `e_i^2`. So a soft body decides, and equal bodies
+    keep their e. The other rules are those of physics engines, and have no derivation:
+    'product', 'mean', 'geometric_mean', 'minimum', 'maximum'.
 
     Args:
         first: e1 in [0, 1] of a material against itself (or against a rigid body).
@@ -143,14 +171,16 @@ def pair_restitution(
         stiffness2: k2 > 0; `inf` for a rigid body, which stores no energy, of either.
 
     Returns:
-        e, of the common shape. Derivatives: of the geometric mean infinite at e = 0; one-sided of
-        minimum and maximum at equal values, and of rule 'energy' at e1 = e2 = 0.
+        e, of the common shape. Derivatives: of the geometric mean infinite at e = 0;
+        one-sided of minimum and maximum at equal values, and of rule 'energy' at e1 =
+        e2 = 0.
 
     Raises:
-        ValueError: another rule, e outside [0, 1], stiffnesses not positive, missing, or given for
-            a rule that has none, both infinite.
+        ValueError: another rule, e outside [0, 1], stiffnesses not positive, missing,
+            or given for a rule that has none, both infinite.
 
-    Source: Coaplen, Stronge and Ravani, Int. J. Impact Engineering 30 (2004), 581 (energy).
+    Source: Coaplen, Stronge and Ravani, Int. J. Impact Engineering 30 (2004), 581
+    (energy).
 
     >>> import jimpact as ji
     >>> round(float(ji.theory.pair_restitution(0.9, 0.5, "geometric_mean")), 4)
@@ -160,21 +190,31 @@ def pair_restitution(
     0.5055
     """
     check_choice("rule", rule, (*_RULES, "energy"))
-    e1, e2 = as_float_array("first", first), as_float_array("second", second)
+    e1 = as_float_array("first", first)
+    e2 = as_float_array("second", second)
     for name, e in (("first", e1), ("second", e2)):
         check_values(name, e, low=0.0, high=1.0)
     given = [
-        name for name, k in (("stiffness", stiffness), ("stiffness2", stiffness2)) if k is not None
+        name
+        for name, k in (("stiffness", stiffness), ("stiffness2", stiffness2))
+        if k is not None
     ]
     if rule != "energy":
         if given:
-            raise ValueError(f"Argument `{given[0]}` must be left out for rule {rule!r}.")
+            raise ValueError(
+                f"Argument `{given[0]}` must be left out for rule {rule!r}."
+            )
         return _RULES[rule](e1, e2)
     if len(given) < 2:
-        raise ValueError("Arguments `stiffness` and `stiffness2` must be given for rule 'energy'.")
-    k1, k2 = as_float_array("stiffness", stiffness), as_float_array("stiffness2", stiffness2)
+        raise ValueError(
+            "Arguments `stiffness` and `stiffness2` must be given for rule 'energy'."
+        )
+    k1 = as_float_array("stiffness", stiffness)
+    k2 = as_float_array("stiffness2", stiffness2)
     for name, k in (("stiffness", k1), ("stiffness2", k2)):  # infinite: rigid
-        check_values(name, jnp.minimum(k, jnp.finfo(k.dtype).max), low=0.0, open_low=True)
+        check_values(
+            name, jnp.minimum(k, jnp.finfo(k.dtype).max), low=0.0, open_low=True
+        )
     check_values("stiffness", jnp.minimum(k1, k2))  # one of them is finite
     share = (1 / k1) / (1 / k1 + 1 / k2)  # of the energy, that of the first body
     square = share * e1**2 + (1 - share) * e2**2

@@ -1,4 +1,6 @@
-"""Slip after oblique impacts of one contact: springs that hold, and Walton's constants."""
+"""Slip after oblique impacts of one contact: springs that hold, and Walton's
+constants.
+"""
 
 from typing import Any
 
@@ -7,7 +9,8 @@ import jax.numpy as jnp
 
 from jimpact.tools.checks import as_float_array, check_values
 
-# W_tt / W_nn of a homogeneous sphere of mass m on a fixed plane: (1 + m R^2 / I), I = 2/5 m R^2.
+# W_tt / W_nn of a homogeneous sphere of mass m on a fixed plane: (1 + m R^2 / I), I =
+# 2/5 m R^2.
 SPHERE = 3.5
 
 
@@ -16,11 +19,11 @@ def spring_slip(
 ) -> jax.Array:
     """Slip after an impact whose linear tangential spring holds to the end.
 
-    Equation: `u+ = u- cos(pi/2 (1 + e) sqrt(kappa W_tt / W_nn))`: the impact of a linear
-    bistiffness contact lasts a quarter of its period, and e times that in expansion. A superball,
-    `u+ = -u-`, has e = 1 and `kappa = W_nn / W_tt`; there it holds at any `mu |gamma-| >= kappa
-    |u-|`. Elsewhere a spring that is still loaded as F ends slides then; with mu -> inf that takes
-    no time.
+    Equation: `u+ = u- cos(pi/2 (1 + e) sqrt(kappa W_tt / W_nn))`: the impact of a
+    linear bistiffness contact lasts a quarter of its period, and e times that in
+    expansion. A superball, `u+ = -u-`, has e = 1 and `kappa = W_nn / W_tt`; there it
+    holds at any `mu |gamma-| >= kappa |u-|`. Elsewhere a spring that is still loaded as
+    F ends slides then; with mu -> inf that takes no time.
 
     Args:
         slip: u- [m/s].
@@ -66,28 +69,33 @@ def walton_slip(
 ) -> jax.Array:
     """Slip after an impact by Walton's three constants e, mu and beta_0.
 
-    Equation: `u+ = u- max(-beta_0, 1 - mu (1 + e) (W_tt / W_nn) |gamma-| / |u-|)`: gross sliding
-    at large angles, beyond it a constant ratio of slips; W_nt = 0.
+    Equation: `u+ = u- max(-beta_0, 1 - mu (1 + e) (W_tt / W_nn) |gamma-| / |u-|)`:
+    gross sliding at large angles, beyond it a constant ratio of slips; W_nt = 0.
 
     Args:
         slip: u- [m/s], of one direction.
         approach: |gamma-| [m/s], or gamma- itself.
         restitution: e in [0, 1].
         friction: Coulomb's mu >= 0.
-        tangential_restitution: beta_0 in [-1, 1]: -1 without friction, 0 rolling, 1 all returned.
+        tangential_restitution: beta_0 in [-1, 1]: -1 without friction, 0 rolling, 1 all
+            returned.
         ratio: W_tt / W_nn, 7/2 of a homogeneous sphere on a plane.
 
     Returns:
-        u+ [m/s], of the common shape. The slope jumps where sliding ends; at u- = 0 it is -beta_0.
+        u+ [m/s], of the common shape. The slope jumps where sliding ends; at u- = 0 it
+        is -beta_0.
 
     Raises:
         ValueError: values outside these ranges.
 
-    Source: Walton (1993) in Roco, Particulate Two-Phase Flow; Foerster, Louge, Chang and Allia,
-    Phys. Fluids 6 (1994) 1108.
+    Source: Walton (1993) in Roco, Particulate Two-Phase Flow; Foerster, Louge, Chang
+    and Allia, Phys. Fluids 6 (1994) 1108.
 
     >>> import jimpact as ji
-    >>> [round(float(ji.theory.walton_slip(u, 1.0, 0.9, 0.1, 0.5)), 3) for u in (0.2, 2.0)]
+    >>> [
+    ...     round(float(ji.theory.walton_slip(u, 1.0, 0.9, 0.1, 0.5)), 3)
+    ...     for u in (0.2, 2.0)
+    ... ]
     [-0.1, 1.335]
     """
     u, gamma, e, mu, beta, w = (

@@ -37,9 +37,11 @@ _FILL = "#DCE9F3"
 # Beyond two contacts: projections onto pairs of the first ones up to this number.
 _MOST_CONTACTS = 4
 _SAMPLES = 2000  # points drawn of a set of outcomes
-_SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no space for a name
+# sides shorter than this part of the radius are not drawn: no space for a name
+_SHORTEST = 0.5
 
-_OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
+# as OUTCOMES
+_OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")
 
 
 @styled(AdmissibleSet)
@@ -48,15 +50,15 @@ def admissible_set(
 ) -> Figure:
     """The set of admissible outcomes, and labelled outcomes v+ (n,) of laws.
 
-    Two contacts: the plane of kinetic coordinates, where energy is the squared distance from the
-    point of common velocity; the arc A-B conserves it (Brogliato 2016, Fig. 6.3). Otherwise
-    samples of the set, in the normalized gap velocities of pairs of contacts, coloured by the
-    energy ratio T+/T-; for one contact, against it.
+    Two contacts: the plane of kinetic coordinates, where energy is the squared distance
+    from the point of common velocity; the arc A-B conserves it (Brogliato 2016, Fig.
+    6.3). Otherwise samples of the set, in the normalized gap velocities of pairs of
+    contacts, coloured by the energy ratio T+/T-; for one contact, against it.
 
     Args:
         result: what `admissible_set` returned.
-        outcomes: label -> v+ (n,) [m/s], an `Impact.velocity` for instance; drawn even when they
-            are not admissible (hollow).
+        outcomes: label -> v+ (n,) [m/s], an `Impact.velocity` for instance; drawn even
+            when they are not admissible (hollow).
         title: empty for a default one.
 
     Returns:
@@ -74,43 +76,65 @@ def admissible_set(
     for name, v in marked.items():
         if v.shape != (result.scene.size,):
             raise ValueError(
-                f"Argument `outcomes` must have arrays of shape ({result.scene.size},), but "
+                f"Argument `outcomes` must have arrays of shape "
+                f"({result.scene.size},), but "
                 f"{name!r} has shape {v.shape}."
             )
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2
-    closed = closed if len(closed) else np.arange(result.scene.contacts)
-    draw = _draw_plane if plane else _draw_projections
+    if not len(closed):
+        closed = np.arange(result.scene.contacts)
+    if plane:
+        draw = _draw_plane
+    else:
+        draw = _draw_projections
     default = "Admissible: unilateral contact, pushing impulses, no energy gained"
     return draw(result, marked, closed, title or default)
 
 
 def _draw_plane(
-    result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
+    result: AdmissibleSet,
+    marked: Mapping[str, np.ndarray],
+    closed: np.ndarray,
+    title: str,
 ) -> Figure:
-    """Draw the set of two contacts in the plane of kinetic coordinates, with marked outcomes.
+    """Draw the set of two contacts in the plane of kinetic coordinates, with marked
+    outcomes.
 
-    Sides are `gamma_k+ = 0` and `p_k = 0`, the arc is T+ = T-; `closed` are both contacts.
+    Sides are `gamma_k+ = 0` and `p_k = 0`, the arc is T+ = T-; `closed` are both
+    contacts.
     """
     frame = _TurnedCoordinates(result, closed)
     figure, axes = new_figure(7.6, title)
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
-    axes.plot(r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3)))
+    axes.plot(
+        r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3))
+    )
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
-    for k in (0, 1):  # gamma_k+ = 0 from u = 0; p_k = 0 from v- along the other contact's push
+    # gamma_k+ = 0 from u = 0; p_k = 0 from v- along the other contact's push
+    for k in (0, 1):
         number = closed[k] + 1
         _draw_side(
-            axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-"
+            axes,
+            frame,
+            np.zeros(2),
+            frame.walls[k],
+            f"contact {number} remains closed",
+            "-",
         )
         away = frame.push[1 - k]
-        _draw_side(axes, frame, frame.before, away, f"no impulse at contact {number}", ":")
+        _draw_side(
+            axes, frame, frame.before, away, f"no impulse at contact {number}", ":"
+        )
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
     write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
     for name, end in (("A", arc[0]), ("B", arc[-1])):
         write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
-    axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label="before the impact")
+    axes.plot(
+        *frame.before, "o", color="black", ms=8, ls="none", label="before the impact"
+    )
     mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
     for i, (name, v) in enumerate(marked.items()):
         mark(axes, frame(v), name, i, bool(result.contains(v)))
@@ -123,10 +147,12 @@ def _draw_plane(
 
 
 class _TurnedCoordinates:
-    """Kinetic coordinates u (2,) [sqrt(J)] turned so that outcomes with gamma+ >= 0 open upwards.
+    """Kinetic coordinates u (2,) [sqrt(J)] turned so that outcomes with gamma+ >= 0
+    open upwards.
 
-    `push` and `walls` (2, 2): a unit vector for each contact, along the change of u by its impulse,
-    and along the line on which it stays closed and the other contact opens. `before`: u of v-.
+    `push` and `walls` (2, 2): a unit vector for each contact, along the change of u by
+    its impulse, and along the line on which it stays closed and the other contact
+    opens. `before`: u of v-.
     """
 
     def __init__(self, result: AdmissibleSet, closed: np.ndarray):
@@ -148,7 +174,9 @@ class _TurnedCoordinates:
         self.before = self(result.velocity)
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
-        """Turned coordinates `u = R axes^T M (v - centre)` (..., 2) of velocities v (..., n)."""
+        """Turned coordinates `u = R axes^T M (v - centre)` (..., 2) of velocities v
+        (..., n).
+        """
         return (velocity - self._set.centre) @ self._metric.T @ self._turn.T
 
 
@@ -160,7 +188,8 @@ def _draw_side(
     text: str,
     style: str,
 ) -> None:
-    """Draw a side of the set as a ray from `start` (2,) to the circle |u| = r, with its name.
+    """Draw a side of the set as a ray from `start` (2,) to the circle |u| = r, with its
+    name.
 
     Equation: `|start + length direction| = r`, direction (2,) of length 1.
     """
@@ -170,15 +199,27 @@ def _draw_side(
     if length < _SHORTEST * frame.radius:
         return
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
-    angle = np.degrees(np.arctan2(direction[1], direction[0]))  # of the name, never upside down
-    angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
-    share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
+    # of the name, never upside down
+    angle = np.degrees(np.arctan2(direction[1], direction[0]))
+    if angle > 90:
+        angle = angle - 180
+    elif angle < -90:
+        angle = angle + 180
+    if style == "-":
+        share = 0.45
+        side = "top"
+    else:
+        share = 0.3
+        side = "bottom"
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
     write(axes, start + share * length * direction, text, color=GREY, **turned)
 
 
 def _draw_projections(
-    result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
+    result: AdmissibleSet,
+    marked: Mapping[str, np.ndarray],
+    closed: np.ndarray,
+    title: str,
 ) -> Figure:
     """Draw samples of the set over pairs of normalized gap velocities qn+ [sqrt(J)].
 
@@ -187,20 +228,30 @@ def _draw_projections(
     contacts = closed[:_MOST_CONTACTS]
     samples = result.sample(0, _SAMPLES)
     norm = np.asarray(kinetic_norm(result.scene), float)
-    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]  # qn = unit^T v
-    cloud, energies = samples @ unit, _energy_ratio(result, samples)
+    # qn = unit^T v
+    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
+    cloud = samples @ unit
+    energies = _energy_ratio(result, samples)
     pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8, title)
     energy = "energy ratio $T^+ / T^-$"
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
-        y = energies if single else cloud[:, j]
+        if single:
+            y = energies
+        else:
+            y = cloud[:, j]
         dots = axes.scatter(cloud[:, i], y, c=energies, s=5, lw=0, vmin=0, vmax=1)
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
-            height = _energy_ratio(result, v) if single else point[j]
+            if single:
+                height = _energy_ratio(result, v)
+            else:
+                height = point[j]
             mark(axes, (point[i], height), name, k, bool(result.contains(v)))
-        labels = [f"normalized gap velocity {contacts[c] + 1} after [√J]" for c in (i, j)]
+        labels = [
+            f"normalized gap velocity {contacts[c] + 1} after [√J]" for c in (i, j)
+        ]
         axes.set_xlabel(labels[0], fontsize=SMALL)
         axes.set_ylabel(energy if single else labels[1], fontsize=SMALL)
     figure.colorbar(dots, ax=grid.tolist(), label=energy)
@@ -211,12 +262,14 @@ def _draw_projections(
 def _energy_ratio(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
     """T+ / T- (...,) of velocities (..., n)."""
     energy = 0.5 * np.sum(velocity @ dense_mass(result.scene) * velocity, axis=-1)
-    return energy / result.energy if result.energy else np.ones_like(energy)
+    if result.energy:
+        return energy / result.energy
+    return np.ones_like(energy)
 
 
 @styled(RockingDispersion)
 def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
-    """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
+    """Dispersion against the kinetic angle: a panel for each mu, a line for each e.
 
     The dotted line is `critical_kinetic_angle`.
 
@@ -231,14 +284,21 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     >>> import numpy as np
     >>> zero = np.zeros((2, 1, 1))
     >>> axes = map(np.array, ([1.0, 2], [0.1], [0.5]))
-    >>> d = ji.theory.RockingDispersion(*axes, np.zeros((2, 1, 1, 2)), zero, zero, zero, zero)
+    >>> d = ji.theory.RockingDispersion(
+    ...     *axes, np.zeros((2, 1, 1, 2)), zero, zero, zero, zero
+    ... )
     >>> len(ji.plot.rocking_dispersion(d).axes)
     1
     """
     figure, panels = _panels(result, title, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
-    theta, size = np.degrees(result.kinetic_angle), np.abs(result.dispersion)
+    theta = np.degrees(result.kinetic_angle)
+    size = np.abs(result.dispersion)
     for j, axes in enumerate(panels):
-        axes.plot(theta, size[:, j], label=[f"e = {e:g}" for e in np.asarray(result.restitution)])
+        axes.plot(
+            theta,
+            size[:, j],
+            label=[f"e = {e:g}" for e in np.asarray(result.restitution)],
+        )
     _critical_lines(panels, result)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     legend_below(figure, 6)
@@ -249,14 +309,15 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
 def rocking_outcomes(
     result: RockingDispersion, title: str = "", separation_threshold: float = STAYS
 ) -> Figure:
-    """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
+    """Rest, rocking, half-rocking, free over the kinetic angle and e, by mu.
 
     The dotted line is `critical_kinetic_angle`.
 
     Args:
         result: what `ji.theory.rocking_dispersion` returned.
         title: above the picture.
-        separation_threshold: largest speed, over |gamma_B-|, of a corner that remains closed.
+        separation_threshold: largest speed, over |gamma_B-|, of a corner that remains
+            closed.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -265,26 +326,31 @@ def rocking_outcomes(
     >>> import numpy as np
     >>> zero = np.zeros((2, 1, 2))
     >>> axes = map(np.array, ([1.0, 2], [0.1], [0.5, 1]))
-    >>> d = ji.theory.RockingDispersion(*axes, np.zeros((2, 1, 2, 2)), zero, zero, zero, zero)
+    >>> d = ji.theory.RockingDispersion(
+    ...     *axes, np.zeros((2, 1, 2, 2)), zero, zero, zero, zero
+    ... )
     >>> len(ji.plot.rocking_outcomes(d).axes)
     1
     """
     figure, panels = _panels(result, title, "restitution e")
     codes = result.outcomes(separation_threshold)
     coloured = by_code(_OUTCOME_COLOURS)
-    theta, e = np.degrees(result.kinetic_angle), np.asarray(result.restitution)
+    theta = np.degrees(result.kinetic_angle)
+    e = np.asarray(result.restitution)
     for j, axes in enumerate(panels):
         axes.grid(False)
         axes.pcolormesh(theta, e, codes[:, j].T, shading="nearest", **coloured)
     _critical_lines(panels, result)
-    handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)]
+    handles = [
+        Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)
+    ]
     legend_below(figure, 5, handles)
     return figure
 
 
 @styled()
 def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure:
-    """Admissible restitution matrices of blocks, a panel each: own entry against cross entry.
+    """Admissible restitution matrices of blocks: own entry against cross entry.
 
     Args:
         domains: what `ji.theory.rocking_domain` returned, for one or several blocks.
@@ -301,15 +367,30 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
     1
     """
     if not len(domains):
-        raise ValueError("Argument `domains` must hold at least one domain, but is empty.")
+        raise ValueError(
+            "Argument `domains` must hold at least one domain, but is empty."
+        )
     default = "Admissible restitution matrices of a block"
-    figure, panels = new_panels(len(domains), 3.2, 0.6, title or default, sharex=True, sharey=True)
+    figure, panels = new_panels(
+        len(domains), 3.2, 0.6, title or default, sharex=True, sharey=True
+    )
     for axes, domain in zip(panels, domains):
-        axes.fill(*domain.corners.T, color=_FILL, lw=0, label="free: both corners leave")
+        axes.fill(
+            *domain.corners.T, color=_FILL, lw=0, label="free: both corners leave"
+        )
         axes.plot([0, 0], domain.rocking, color=COLOURS[0], lw=4, label="rocking")
         if domain.half_rocking is not None:
-            axes.plot(domain.half_rocking, [0, 0], color=COLOURS[1], lw=4, label="half-rocking")
-        way = "sliding" if domain.sliding else "sticking"
+            axes.plot(
+                domain.half_rocking,
+                [0, 0],
+                color=COLOURS[1],
+                lw=4,
+                label="half-rocking",
+            )
+        if domain.sliding:
+            way = "sliding"
+        else:
+            way = "sticking"
         axes.set_title(f"height / width {domain.aspect:g}, {way}")
         axes.set(aspect="equal", xlim=(-0.05, 1.1), ylim=(-0.05, 1.1))
     _label_outer(panels, "restitution, corner that hits", "restitution, other corner")
@@ -318,8 +399,12 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
 
 
 def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, Any]:
-    """Figure and panels of rocking blocks, one for each mu, over the kinetic angle [degrees]."""
-    figure, panels = new_panels(len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True)
+    """Figure and panels of rocking blocks, one for each mu, over the kinetic angle
+    [degrees].
+    """
+    figure, panels = new_panels(
+        len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True
+    )
     for axes, mu in zip(panels, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}")
     _label_outer(panels, r"kinetic angle $\theta_{12}$ [degrees]", label)

@@ -1,4 +1,6 @@
-"""Kinetic quasi-velocities: normal and tangential to the contacts in the kinetic metric."""
+"""Kinetic quasi-velocities: normal and tangential to the contacts in the kinetic
+metric.
+"""
 
 from typing import Any
 
@@ -12,14 +14,23 @@ from jimpact.core.contact import (
     normalized_gap_velocity as normalized_gap_velocity,
 )
 from jimpact.core.quasi_space import quasi_basis as quasi_basis
-from jimpact.core.scene import Scene, as_velocity, gap_velocity, momentum, velocity_change
+from jimpact.core.scene import (
+    Scene,
+    as_velocity,
+    gap_velocity,
+    momentum,
+    velocity_change,
+)
 from jimpact.numerics.tridiagonal import as_matrix
 from jimpact.tools.checks import as_numbers
 from jimpact.tools.compiling import full_precision
 
 
 class ContactPower(eqx.Module):
-    """Power of contact forces () [W]: `normal`, `coupling`, `tangential` of (6.40), `total`."""
+    """Power of contact forces () [W], its parts as in (6.40).
+
+    `total` is the sum of `normal`, `coupling` and `tangential`.
+    """
 
     normal: jax.Array
     coupling: jax.Array
@@ -29,10 +40,11 @@ class ContactPower(eqx.Module):
 
 @full_precision
 def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
-    """Quasi-velocities of a velocity: `qn = n_q^T M v` (m,) and `qt = t_q^T M v` (n - m - b,).
+    """Quasi-velocities `qn = n_q^T M v` (m,) and `qt = t_q^T M v` (n - m - b,).
 
-    The columns of n_q (n, m) and t_q (n, n - m - b) are the unit normals of the contacts and an
-    orthonormal basis of all tangents, in the kinetic metric M (`quasi_basis`).
+    The columns of n_q (n, m) and t_q (n, n - m - b) are the unit normals of the
+    contacts and an orthonormal basis of all tangents, in the kinetic metric M
+    (`quasi_basis`).
 
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
@@ -61,8 +73,8 @@ def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Arr
 def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Array:
     """The velocity (n,) with these quasi-velocities; inverse of `to_quasi_velocities`.
 
-    Equation: `v = n_q G^-1 qn + t_q qt`, with the normalized Delassus matrix G and the basis n_q,
-    t_q of `quasi_basis`; n_q without its part along bilateral constraints.
+    Equation: `v = n_q G^-1 qn + t_q qt`, with the normalized Delassus matrix G and the
+    basis n_q, t_q of `quasi_basis`; n_q without its part along bilateral constraints.
 
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
@@ -84,9 +96,13 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
     """
     qn = as_numbers("normal", normal, (scene.contacts,), "one per contact")
     _, tangent = quasi_basis(scene)
-    qt = as_numbers("tangential", tangential, tangent.shape[1:], "one per tangent of `quasi_basis`")
+    qt = as_numbers(
+        "tangential", tangential, tangent.shape[1:], "one per tangent of `quasi_basis`"
+    )
     # n_q G^-1 qn = M^-1 N p with p = G^-1 qn / |grad f|
-    impulse = jnp.linalg.solve(as_matrix(normalized_delassus(scene)), qn) / kinetic_norm(scene)
+    impulse = jnp.linalg.solve(
+        as_matrix(normalized_delassus(scene)), qn
+    ) / kinetic_norm(scene)
     return velocity_change(scene, impulse) + tangent @ qt
 
 
@@ -94,8 +110,8 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
 def kinetic_energy_split(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
     """Normal and tangential kinetic energy [J]; their sum is the kinetic energy.
 
-    Equation: `T_n = qn^T G^-1 qn / 2`, `T_t = qt^T qt / 2`, G the normalized Delassus matrix.
-    Frictionless impacts change T_n only.
+    Equation: `T_n = qn^T G^-1 qn / 2`, `T_t = qt^T qt / 2`, G the normalized Delassus
+    matrix. Frictionless impacts change T_n only.
 
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
@@ -126,11 +142,12 @@ def contact_power(
     """Power that contact forces feed into a motion, split as (6.40).
 
     Equation: with `F_norm^n = G lambda_bar`, `F_norm^t = n_q^T H lambda_t` and
-    `F_tan^t = t_q^T H lambda_t`: `normal = <F_norm^n, qn>_Dn = gamma^T lambda` (6.36)-(6.37),
-    `coupling = <qn, F_norm^t>_Dn`, `tangential = <qt, F_tan^t>_Dt` (6.39), where
-    `<a, b>_D = a^T D b`, `D_n = G^-1`, `D_t = I`, `lambda_bar = |grad f| lambda`; G, n_q, t_q as in
-    `from_quasi_velocities`, H the tangents. Coupling and tangential together are the local power
-    `v_t^T lambda_t` of (6.41).
+    `F_tan^t = t_q^T H lambda_t`: `normal = <F_norm^n, qn>_Dn = gamma^T lambda`
+    (6.36)-(6.37), `coupling = <qn, F_norm^t>_Dn`, `tangential = <qt, F_tan^t>_Dt`
+    (6.39), where
+    `<a, b>_D = a^T D b`, `D_n = G^-1`, `D_t = I`, `lambda_bar = |grad f| lambda`; G,
+    n_q, t_q as in `from_quasi_velocities`, H the tangents. Coupling and tangential
+    together are the local power `v_t^T lambda_t` of (6.41).
 
     Args:
         scene: n coordinates, m contacts; with tangents where tangential forces act.
@@ -158,12 +175,18 @@ def contact_power(
         zero = jnp.zeros_like(normal)
         return ContactPower(normal, zero, zero, normal)
     if scene.tangents is None:
-        raise ValueError("Argument `scene` must have tangents where tangential forces act.")
+        raise ValueError(
+            "Argument `scene` must have tangents where tangential forces act."
+        )
     lambda_t = as_numbers(
-        "tangential_force", tangential_force, scene.tangents.shape[1:], "one per tangent"
+        "tangential_force",
+        tangential_force,
+        scene.tangents.shape[1:],
+        "one per tangent",
     )
     _, t_q = quasi_basis(scene)
-    accelerated = velocity_change(scene, jnp.zeros_like(lambda_n), lambda_t)  # M^-1 H lambda_t
+    # M^-1 H lambda_t
+    accelerated = velocity_change(scene, jnp.zeros_like(lambda_n), lambda_t)
     f_norm = normalized_gap_velocity(scene, accelerated)  # n_q^T H lambda_t
     coupling = qn @ jnp.linalg.solve(as_matrix(normalized_delassus(scene)), f_norm)
     tangential = qt @ (t_q.T @ (scene.tangents @ lambda_t))

@@ -1,4 +1,6 @@
-"""Restitution matrices and coefficients that are admissible for all velocities: Props. 6.2-6.5."""
+"""Restitution matrices and coefficients that are admissible for all velocities: Props.
+6.2-6.5.
+"""
 
 from typing import Any, Literal, NamedTuple
 
@@ -6,26 +8,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.core.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.core.contact import (
+    kinetic_norm,
+    normalized_delassus,
+    normalized_gap_velocity,
+)
 from jimpact.core.scene import Scene, kinetic_energy, velocity_change
 from jimpact.numerics.tridiagonal import as_matrix
 from jimpact.tools.checks import as_numbers, check_values
 from jimpact.tools.compiling import full_precision
 
-# Most rows of a matrix: its 2^12 supports of one eigenproblem each take a fraction of a second.
-# Each row more doubles that.
+# Most rows of a matrix: its 2^12 supports of one eigenproblem each take a fraction of a
+# second. Each row more doubles that.
 LARGEST = 12
-# |margin| below this multiple of the matrix scale is "boundary": rounding of Q reaches about
-# m eps cond(G), so seven digits remain for the condition number in either precision. Ten times more
-# would call clear answers "boundary".
+# |margin| below this multiple of the matrix scale is "boundary": rounding of Q reaches
+# about
+# m eps cond(G), so seven digits remain for the condition number in either precision.
+# Ten times more would call clear answers "boundary".
 COPOSITIVITY_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
 
-# G counts as singular when its smallest eigenvalue is below this multiple of eps * m * largest.
+# G counts as singular when its smallest eigenvalue is below this multiple of eps * m *
+# largest.
 _SINGULAR = 100.0
 
 
 class Copositivity(NamedTuple):
-    """The `answer`, the `margin` min x^T Q x over `x >= 0`, `|x| = 1`, and where, `witness`."""
+    """The `answer`, the `margin` min x^T Q x over x >= 0, |x| = 1, its `witness`."""
 
     answer: Literal["yes", "no", "boundary"]
     margin: float
@@ -40,18 +48,21 @@ class Copositivity(NamedTuple):
 def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Least `x^T Q x` over `x >= 0`, `|x| = 1`, and a minimizer x; pure, jit and vmap.
 
-    Let a minimizer have the smallest possible support S. It is a local minimum of the Rayleigh
-    quotient of Q_SS, hence an eigenvector of the *smallest* eigenvalue, as the quotient has no
-    other local minima. That eigenvalue is simple: else one could move inside its eigenspace
-    until a component vanishes, and S would not be smallest. So the lowest eigenvector of every
-    Q_SS holds the minimizer; clipped to `x >= 0` every one is feasible and none is rejected.
+    Let a minimizer have the smallest possible support S. It is a local minimum of the
+    Rayleigh quotient of Q_SS, hence an eigenvector of the *smallest* eigenvalue, as the
+    quotient has no other local minima. That eigenvalue is simple: else one could move
+    inside its eigenspace
+    until a component vanishes, and S would not be smallest. So the lowest eigenvector
+    of every Q_SS holds the minimizer; clipped to `x >= 0` every one is feasible and
+    none is rejected.
 
     Args:
         matrix: Q (m, m), m <= 12; only its symmetric part counts.
 
     Returns:
         The margin () and x (m,). The margin has the derivative `x^T dQ x` wherever the
-        minimizer is unique (not differentiable elsewhere); x is a constant to differentiation.
+        minimizer is unique (not differentiable elsewhere); x is a constant to
+        differentiation.
 
     Raises:
         ValueError: not square, or m > 12.
@@ -71,8 +82,11 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     # all nonempty sets of indices, as rows of zeros and ones
     supports = ((np.arange(1, 2**m)[:, None] >> np.arange(m)) & 1).astype(q.dtype)
     inside = supports[:, :, None] * supports[:, None, :]
-    outside = (m + 1.0) * (1 - supports)  # above every eigenvalue of Q_SS, which are at most m
-    blocks = inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
+    # above every eigenvalue of Q_SS, which are at most m
+    outside = (m + 1.0) * (1 - supports)
+    blocks = (
+        inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
+    )
     lowest = jnp.linalg.eigh(blocks)[1][:, :, 0] * supports
     lowest = lowest * jnp.where(jnp.sum(lowest, axis=1) < 0, -1.0, 1.0)[:, None]
     x = jnp.maximum(lowest, 0.0)
@@ -90,8 +104,10 @@ def copositivity(
 
     Args:
         matrix: Q (m, m), m <= 12.
-        tolerance: "boundary" where `|margin| <= tolerance * scale`; None: by its precision.
-        scale: None: the largest |Q_ij|. Give it where Q is a difference of larger matrices.
+        tolerance: "boundary" where `|margin| <= tolerance * scale`; None: by its
+            precision.
+        scale: None: the largest |Q_ij|. Give it where Q is a difference of larger
+            matrices.
 
     Returns:
         `Copositivity`: answer, margin, and the x (m,) that decides.
@@ -99,7 +115,8 @@ def copositivity(
     Raises:
         ValueError: not square, m > 12, not finite, negative tolerance or scale.
 
-    Source: all 2^m - 1 supports of x enumerated; Brogliato (2016), Prop. 6.3 asks for it.
+    Source: all 2^m - 1 supports of x enumerated; Brogliato (2016), Prop. 6.3 asks for
+    it.
 
     >>> copositivity([[1.0, -1.0], [-1.0, 1.0]]).answer
     'boundary'
@@ -122,10 +139,13 @@ def _checked_size(matrix: jax.Array) -> int:
     """Number m of rows of a square matrix, checked: 1 to `LARGEST`."""
     shape = np.shape(matrix)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
-        raise ValueError(f"Argument `matrix` must have shape (m, m), but has shape {shape}.")
+        raise ValueError(
+            f"Argument `matrix` must have shape (m, m), but has shape {shape}."
+        )
     if shape[0] > LARGEST:
         raise ValueError(
-            f"Argument `matrix` must have at most {LARGEST} rows, as all 2^m supports are "
+            f"Argument `matrix` must have at most {LARGEST} rows, as all 2^m supports "
+            f"are "
             f"enumerated, but has {shape[0]}."
         )
     return int(shape[0])
@@ -146,10 +166,10 @@ class Sign(NamedTuple):
 class MatrixAudit(NamedTuple):
     """Result of `audit_matrix`; `print(audit)` describes it.
 
-    `kinematic`, `kinetic`: Prop. 6.2 (i), (ii). `energetic`: Prop. 6.3; `bool` of it is True on
-    the boundary too. Of all approaches of one length |qn-|, `worst_normal_velocity` qn- (m,), with
-    `worst_velocity` v- (n,) [m/s], loses least: it gains energy where the answer is "no" and
-    conserves it where it is "boundary".
+    `kinematic`, `kinetic`: Prop. 6.2 (i), (ii). `energetic`: Prop. 6.3; `bool` of it is
+    True on the boundary too. Of all approaches of one length |qn-|,
+    `worst_normal_velocity` qn- (m,), with `worst_velocity` v- (n,) [m/s], loses least:
+    it gains energy where the answer is "no" and conserves it where it is "boundary".
     `spectral_radius` and `spectral` (Prop. 6.4) are None unless E is self-adjoint.
     `singular_value` <= `singular_value_bound` is Prop. 6.5, sufficient only.
     """
@@ -171,14 +191,23 @@ class MatrixAudit(NamedTuple):
 
     @property
     def admissible(self) -> bool:
-        """Kinematic, kinetic and energetic consistency for every pre-impact velocity."""
+        """Kinematic, kinetic and energetic consistency for every pre-impact
+        velocity.
+        """
         return self.kinematic.holds and self.kinetic.holds and bool(self.energetic)
 
     def __str__(self) -> str:
         """Report: the verdict, and each proposition with its numbers, a line each."""
-        kinematic, kinetic, energetic = self.kinematic, self.kinetic, self.energetic
-        verdict = "admissible" if self.admissible else "NOT admissible"
-        lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
+        kinematic = self.kinematic
+        kinetic = self.kinetic
+        energetic = self.energetic
+        if self.admissible:
+            verdict = "admissible"
+        else:
+            verdict = "NOT admissible"
+        lines = [
+            f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"
+        ]
         for title, sign, what in (
             ("kinematic  (6.2 i)  E >= 0", kinematic, "still approaches"),
             ("kinetic    (6.2 ii) G^-1 (I + E) >= 0", kinetic, "would have to pull"),
@@ -195,15 +224,21 @@ class MatrixAudit(NamedTuple):
             "boundary": "boundary, energy never grows but is conserved",
         }[energetic.answer]
         if energetic.answer != "yes":
-            qn, v = _as_text(self.worst_normal_velocity), _as_text(self.worst_velocity)
+            qn = _as_text(self.worst_normal_velocity)
+            v = _as_text(self.worst_velocity)
             text += f" for qn- = {qn}, v- = {v}"
         lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
         if self.spectral is None:
             text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
         else:
-            text = f"{'yes' if self.spectral else 'NO'}, rho = {self.spectral_radius:.4g}"
+            text = (
+                f"{'yes' if self.spectral else 'NO'}, rho = {self.spectral_radius:.4g}"
+            )
         lines.append(f"spectral   (6.4)    rho(E) <= 1: {text}")
-        holds = "yes" if self.singular_values else "does not hold, which decides nothing"
+        if self.singular_values:
+            holds = "yes"
+        else:
+            holds = "does not hold, which decides nothing"
         lines.append(
             f"sufficient (6.5)    sigma_max(E) = {self.singular_value:.4g} <= "
             f"{self.singular_value_bound:.4g}: {holds}"
@@ -213,7 +248,7 @@ class MatrixAudit(NamedTuple):
 
 @full_precision
 def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
-    """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2.
+    """`Q = G^-1 - E^T G^-1 E` (m, m): qn+ = -E qn- loses `qn-^T Q qn- / 2`.
 
     Args:
         delassus: G (m, m), see `ji.theory.normalized_delassus`.
@@ -226,26 +261,32 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
-    >>> ji.theory.dissipation_matrix(jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))).tolist()
+    >>> ji.theory.dissipation_matrix(
+    ...     jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))
+    ... ).tolist()
     [[0.75, 0.0], [0.0, 0.0]]
     """
     return jnp.linalg.inv(delassus) - matrix.T @ jnp.linalg.solve(delassus, matrix)
 
 
 @full_precision
-def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> MatrixAudit:
+def audit_matrix(
+    scene: Scene, matrix: Any, tolerance: float | None = None
+) -> MatrixAudit:
     """Check the law `qn+ = -E qn-` for all pre-impact velocities `qn- <= 0` at once.
 
-    Equation, with the normalized Delassus matrix G: `E >= 0` (kinematic) and `G^-1 (I + E) >= 0`
-    (kinetic), elementwise, necessary and sufficient (Prop. 6.2); `Q = G^-1 - E^T G^-1 E`
-    copositive (energetic, necessary and sufficient, Prop. 6.3); where `G^-1 E` is symmetric,
-    spectral radius `rho(E) <= 1` (Prop. 6.4, for qn- of any sign);
+    Equation, with the normalized Delassus matrix G: `E >= 0` (kinematic) and
+    `G^-1 (I + E) >= 0` (kinetic), elementwise, necessary and sufficient (Prop. 6.2);
+    `Q = G^-1 - E^T G^-1 E` copositive (energetic, necessary and sufficient, Prop. 6.3);
+    where `G^-1 E` is symmetric, spectral radius `rho(E) <= 1` (Prop. 6.4, for qn- of
+    any sign);
     `sigma_max(E) <= 1 / sqrt(cond G)` (Prop. 6.5, sufficient).
 
     Args:
         scene: m contacts; open ones are left out, with their rows and columns of E.
         matrix: E (m, m), dimensionless, between normalized gap velocities.
-        tolerance: relative size of what counts as zero; None: by the precision of the scene.
+        tolerance: relative size of what counts as zero; None: by the precision of the
+            scene.
 
     Returns:
         `MatrixAudit`; `print` says it in words.
@@ -254,11 +295,16 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
         ValueError: E not (m, m) or not finite; more than 12 closed contacts, or none;
             redundant contacts (G singular): then not every qn- is possible.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), Props. 6.2-6.5 (rho instead of lambda_max).
+    Source: Brogliato, Nonsmooth Mechanics (2016), Props. 6.2-6.5 (rho instead of
+    lambda_max).
 
     >>> import jimpact as ji
     >>> result = audit_matrix(ji.chain([1.0, 1.0, 1.0]), [[0.0, 1.2], [0.2, 0.0]])
-    >>> result.admissible, result.energetic.answer, result.worst_velocity.round(2).tolist()
+    >>> (
+    ...     result.admissible,
+    ...     result.energetic.answer,
+    ...     result.worst_velocity.round(2).tolist(),
+    ... )
     (False, 'no', [0.47, 0.47, -0.94])
     """
     array = as_numbers(
@@ -275,14 +321,21 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     scale = max(np.abs(inverse).max(), np.abs(e.T @ inverse @ e).max())
     energetic = copositivity(q, tolerance, scale)
     impulse = np.zeros(len(closed))
-    impulse[closed] = inverse @ -energetic.witness / np.asarray(kinetic_norm(scene), float)[closed]
+    impulse[closed] = (
+        inverse @ -energetic.witness / np.asarray(kinetic_norm(scene), float)[closed]
+    )
     # the v- without any motion along the contacts: v = M^-1 N p has qn = G pbar
     worst = velocity_change(scene, jnp.asarray(impulse, scene.mass.dtype)) + 0.0
     worst_normal = np.array(normalized_gap_velocity(scene, worst), float)
     worst_normal[closed] = 0.0 - energetic.witness
     skew = inverse @ e - (inverse @ e).T  # 0: E is self-adjoint
-    self_adjoint = np.abs(skew).max() <= tolerance * max(np.abs(inverse @ e).max(), 1e-300)
-    radius = float(np.abs(np.linalg.eigvals(e)).max()) if self_adjoint else None
+    self_adjoint = np.abs(skew).max() <= tolerance * max(
+        np.abs(inverse @ e).max(), 1e-300
+    )
+    if self_adjoint:
+        radius = float(np.abs(np.linalg.eigvals(e)).max())
+    else:
+        radius = None
     return MatrixAudit(
         kinematic=_nonnegativity(e, tolerance * max(1.0, np.abs(e).max()), closed),
         kinetic=_nonnegativity(inverse + inverse @ e, tolerance * scale, closed),
@@ -299,9 +352,11 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
 def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.Array:
     """Energy lost, `T- - T+ = (1 - e)/(1 + e) |v+ - v-|_M^2 / 2` [J] (Carnot).
 
-    For e = 0 (persistent contact) the loss is the energy of the lost velocities, whatever the
-    contacts, redundant ones included. For one e at all contacts it holds for Newton's E = e I
-    and for Moreau's law, as both have `qn+^T pbar = -e qn-^T pbar`; else it does not apply.
+    For e = 0 (persistent contact) the loss is the energy of the lost velocities,
+    whatever the contacts, redundant ones included. For one e at all contacts it holds
+    for Newton's E = e I
+    and for Moreau's law, as both have `qn+^T pbar = -e qn-^T pbar`; else it does not
+    apply.
 
     Args:
         scene: the scene of the impact.
@@ -321,7 +376,9 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
     0.25
     """
     change = as_numbers("jump", jump, (scene.size,), "one per coordinate of the scene")
-    e = as_numbers("restitution", restitution, (), "one for all contacts", low=0.0, high=1.0)
+    e = as_numbers(
+        "restitution", restitution, (), "one for all contacts", low=0.0, high=1.0
+    )
     return (1 - e) / (1 + e) * kinetic_energy(scene, change)
 
 
@@ -329,18 +386,26 @@ def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Normalized Delassus matrix G of the closed contacts, and their mask (m,)."""
     closed = np.asarray(scene.closed)
     if not closed.any():
-        raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")
-    return np.asarray(as_matrix(normalized_delassus(scene)), float)[np.ix_(closed, closed)], closed
+        raise ValueError(
+            "Argument `scene` must have a closed contact, but all gaps are open."
+        )
+    return np.asarray(as_matrix(normalized_delassus(scene)), float)[
+        np.ix_(closed, closed)
+    ], closed
 
 
 def _check_independent(scene: Scene, g: np.ndarray) -> None:
-    """Raise a ValueError if contacts are redundant: G, of the closed ones, is singular."""
+    """Raise a ValueError if contacts are redundant: G, of the closed ones, is
+    singular.
+    """
     eigenvalues = np.linalg.eigvalsh(g)
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * len(g) * eigenvalues[-1]
     if eigenvalues[0] <= floor:
         raise ValueError(
-            f"Argument `scene` must have independent contacts, but its {len(g)} closed contacts "
-            f"have rank {int((eigenvalues > floor).sum())}: G is singular, and a matrix law "
+            f"Argument `scene` must have independent contacts, but its {len(g)} closed "
+            f"contacts "
+            f"have rank {int((eigenvalues > floor).sum())}: G is singular, and a "
+            f"matrix law "
             "cannot be consistent for every velocity."
         )
 
@@ -348,15 +413,18 @@ def _check_independent(scene: Scene, g: np.ndarray) -> None:
 def _nonnegativity(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     """Verdict on `a >= 0`, entry by entry, of a matrix between the closed contacts.
 
-    Column j of `a` is the result (qn+ or pbar) of an approach of contact j alone, qn-_j = -1.
-    `closed` (m,) is the mask of these contacts; entries down to -`tolerance` pass.
+    Column j of `a` is the result (qn+ or pbar) of an approach of contact j alone, qn-_j
+    = -1. `closed` (m,) is the mask of these contacts; entries down to -`tolerance`
+    pass.
     """
     at = np.unravel_index(np.argmin(a), a.shape)
     contact = np.flatnonzero(closed)
     velocity = np.zeros(len(closed))
     velocity[contact[at[1]]] = -1.0
     worst = float(a[at])
-    return Sign(worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity)
+    return Sign(
+        worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity
+    )
 
 
 def _as_text(vector: np.ndarray) -> str:
@@ -367,8 +435,9 @@ def _as_text(vector: np.ndarray) -> str:
 class CoefficientAudit(NamedTuple):
     """Result of `audit_coefficients`: can an impact by Moreau's law gain energy?
 
-    `energetic` is true where none gains; else its `witness` pbar >= 0 are the normalized impulses
-    of an impact that does. `spread` <= `spread_allowed` is sufficient that none gains.
+    `energetic` is true where none gains; else its `witness` pbar >= 0 are the
+    normalized impulses of an impact that does. `spread` <= `spread_allowed` is
+    sufficient that none gains.
     """
 
     energetic: Copositivity
@@ -377,8 +446,14 @@ class CoefficientAudit(NamedTuple):
 
     def __str__(self) -> str:
         """Report: the verdict, and the sufficient condition with its numbers."""
-        verdict = "no impact gains energy" if self.energetic else "some impacts GAIN energy"
-        holds = "holds" if self.spread <= self.spread_allowed else "does not, which decides nothing"
+        if self.energetic:
+            verdict = "no impact gains energy"
+        else:
+            verdict = "some impacts GAIN energy"
+        if self.spread <= self.spread_allowed:
+            holds = "holds"
+        else:
+            holds = "does not, which decides nothing"
         return (
             f"Moreau's law with these coefficients: {verdict}\n"
             f"sufficient: {self.spread:.4g} <= {self.spread_allowed:.4g}: {holds}"
@@ -386,14 +461,14 @@ class CoefficientAudit(NamedTuple):
 
 
 def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
-    """Decide if Moreau's law with coefficients e_j can gain energy in a frictionless impact.
+    """Decide if Moreau's law with coefficients e_j can gain energy.
 
     Equation: it changes the energy by `-pbar^T D G pbar / 2`, `D = diag(d_j)`,
-    `d_j = (1 - e_j) / (1 + e_j)`, G the normalized Delassus matrix, and every `pbar = |grad f| p`
-    >= 0 occurs in some impact: none gains exactly where the symmetric part of D G is copositive.
-    It suffices that
-    `(d_max - d_min) / (d_max + d_min) <= 1 / cond(G)`. One e for all contacts never gains.
-    (Poisson's law never does up to e = 1: see `Poisson`.)
+    `d_j = (1 - e_j) / (1 + e_j)`, G the normalized Delassus matrix, and every
+    `pbar = |grad f| p` >= 0 occurs in some impact: none gains exactly where the
+    symmetric part of D G is copositive. It suffices that
+    `(d_max - d_min) / (d_max + d_min) <= 1 / cond(G)`. One e for all contacts never
+    gains. (Poisson's law never does up to e = 1: see `Poisson`.)
 
     Args:
         scene: up to 12 contacts; open ones are left out.
@@ -403,26 +478,33 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
         `CoefficientAudit`; `print` says it in words.
 
     Raises:
-        ValueError: restitution out of range or of a wrong size, no closed contact, too many.
+        ValueError: restitution out of range or of a wrong size, no closed contact, too
+            many.
 
     Host function, not differentiable.
 
-    Source: own derivation from Brogliato (2016), (6.51); Leine and van de Wouw, Stability and
-    Convergence of Mechanical Systems with Unilateral Constraints (2008), give such conditions.
+    Source: own derivation from Brogliato (2016), (6.51); Leine and van de Wouw,
+    Stability and Convergence of Mechanical Systems with Unilateral Constraints (2008),
+    give such conditions.
 
     >>> import jimpact as ji
     >>> print(ji.theory.audit_coefficients(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0]))
     Moreau's law with these coefficients: some impacts GAIN energy
     sufficient: 1 <= 0.3333: does not, which decides nothing
     """
-    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
+    e = as_numbers(
+        "restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts
+    )
     g, closed = _closed_delassus(scene)
     each = np.broadcast_to(np.asarray(e, float), closed.shape)[closed]
     d = (1 - each) / (1 + each)
     weighted = d[:, None] * g  # D G
-    low, high = float(d.min()), float(d.max())
+    low = float(d.min())
+    high = float(d.max())
     return CoefficientAudit(
-        energetic=copositivity((weighted + weighted.T) / 2, scale=float(np.abs(g).max())),
+        energetic=copositivity(
+            (weighted + weighted.T) / 2, scale=float(np.abs(g).max())
+        ),
         spread=(high - low) / (high + low) if high > 0 else 0.0,
         spread_allowed=1 / float(np.linalg.cond(g)),
     )

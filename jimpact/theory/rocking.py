@@ -1,4 +1,6 @@
-"""The rocking block: outcomes of its impacts over its shape, restitution matrices, measurements."""
+"""The rocking block: outcomes of its impacts over its shape, restitution matrices,
+measurements.
+"""
 
 from importlib.resources import files
 from typing import Any, NamedTuple
@@ -15,19 +17,22 @@ from jimpact.tools.checks import as_axis, as_numbers, check_values
 from jimpact.tools.compiling import precise_jit
 from jimpact.tools.status import STATUS
 
-# After the impact a corner counts as staying on the ground up to this gap velocity, as part of the
-# approach of B: real corners are not sharp, and slow ones touch down again at once. Ten times more
-# would call most rocking blocks resting.
+# After the impact a corner counts as staying on the ground up to this gap velocity, as
+# part of the approach of B: real corners are not sharp, and slow ones touch down again
+# at once. Ten times more would call most rocking blocks resting.
 STAYS = 0.05
 OUTCOMES = ("rest", "rocking", "half-rocking", "free", "unresolved")
 _FAILS = np.array([row.failure for row in STATUS])
-_ZOOMS, _POINTS = 6, 41  # grids of the search, each twenty times finer than the one before
+# grids of the search, each twenty times finer than the one before
+_ZOOMS = 6
+_POINTS = 41
 
 
 class RockingRatio(NamedTuple):
-    """A measured restitution of angular velocity, `measured_over_housner` times the rigid value.
+    """A measured restitution of angular velocity, beside that of a rigid block.
 
-    `aspect` = height / width; `material` of the interface.
+    `aspect` = height / width; `material` of the interface; `measured_over_housner`: the
+    measured restitution over that of the rigid block.
     """
 
     aspect: float
@@ -41,14 +46,15 @@ class RockingRatio(NamedTuple):
 
 
 def housner_restitution(aspect: Any) -> jax.Array:
-    """Angular velocity after over before, of a rigid block that rocks from corner to corner.
+    """Angular velocity after over before, of a rigid block that rocks.
 
     Equation: `e_theta = 1 - (3/2) sin^2(alpha)`, `tan(alpha) = 1 / aspect`, which is
-    `(2 a^2 - 1) / (2 (a^2 + 1))`: conserved angular momentum about the corner that is hit.
+    `(2 a^2 - 1) / (2 (a^2 + 1))`: conserved angular momentum about the corner that is
+    hit.
 
     Args:
-        aspect: a = height / width > 0; scalar or array. Below `1 / sqrt(2)` the value is
-            negative: such a block does not rock.
+        aspect: a = height / width > 0; scalar or array. Below `1 / sqrt(2)` the value
+            is negative: such a block does not rock.
 
     Returns:
         e_theta, of the shape of `aspect`.
@@ -69,8 +75,9 @@ def housner_restitution(aspect: Any) -> jax.Array:
 def rocking_matrix(restitution: Any) -> jax.Array:
     """Restitution matrix (3, 3) of a block that rocks without slip or rebound.
 
-    Equation: `E = [[0, e, 0], [e, 0, 0], [0, 0, -e]]` in (qn_1, qn_2, qt): rotating about one
-    corner and hitting with the other, `gamma_2+ = -e gamma_1-`, `gamma_1+ = 0`, `qt+ = e qt-`,
+    Equation: `E = [[0, e, 0], [e, 0, 0], [0, 0, -e]]` in (qn_1, qn_2, qt): rotating
+    about one corner and hitting with the other, `gamma_2+ = -e gamma_1-`,
+    `gamma_1+ = 0`, `qt+ = e qt-`,
     so that the angular velocity about the new corner is e times the old one.
 
     Args:
@@ -82,9 +89,9 @@ def rocking_matrix(restitution: Any) -> jax.Array:
     Raises:
         ValueError: e_theta out of range, or more than one.
 
-    Status: an impact with less than Housner's value (`housner_restitution`) is `negative_impulse`:
-    the corner that is left behind would have to be pulled down. Exactly there its impulse is 0, and
-    derivatives are one-sided.
+    Status: an impact with less than Housner's value (`housner_restitution`) is
+    `negative_impulse`: the corner that is left behind would have to be pulled down.
+    Exactly there its impulse is 0, and derivatives are one-sided.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.2.2, with the signs of
     `v+ = -E v-`.
@@ -101,7 +108,8 @@ def rocking_matrix(restitution: Any) -> jax.Array:
 def rocking_ratios() -> list[RockingRatio]:
     """Measured ratios of freely rocking blocks, bundled with the package.
 
-    Times Housner's value they give e_theta, and with `rocking_matrix` a restitution matrix:
+    Times Housner's value they give e_theta, and with `rocking_matrix` a restitution
+    matrix:
     a conversion of published numbers, not a fit.
 
     Returns:
@@ -118,18 +126,21 @@ def rocking_ratios() -> list[RockingRatio]:
     """
     rows = (files("jimpact") / "data" / "rocking_ratio.csv").read_text(encoding="utf-8")
     lines = [line.split(",") for line in rows.splitlines()[1:]]
-    return [RockingRatio(float(a), material, float(ratio)) for a, material, ratio in lines]
+    return [
+        RockingRatio(float(a), material, float(ratio)) for a, material, ratio in lines
+    ]
 
 
 class RockingDispersion(eqx.Module):
-    """Impacts of a block that rocks about A and hits with B; arrays (aspects, mu, e, ...).
+    """Impacts of a block that rocks about A and hits with B, over aspects, mu, e.
 
     Attributes:
         aspect: a = height / width (A,).
         friction: mu (B,).
         restitution: energetic e (C,).
         gap_velocity: gamma+ / |gamma_B-| (A, B, C, 2), of B and A.
-        angular_ratio: theta'+ / theta'- (A, B, C); compare with `housner_restitution(aspect)`.
+        angular_ratio: theta'+ / theta'- (A, B, C); compare with
+            `housner_restitution(aspect)`.
         slip_velocity: of both corners after, / |gamma_B-| (A, B, C).
         energy_ratio: T+ / T- (A, B, C).
         status: codes (A, B, C); values of failures are NaN.
@@ -160,37 +171,48 @@ class RockingDispersion(eqx.Module):
         return self.angular_ratio / housner_restitution(self.aspect)[:, None, None]
 
     def outcomes(self, separation_threshold: float = STAYS) -> np.ndarray:
-        """Classes of the impacts (A, B, C), as indices of `OUTCOMES`: which corners leave.
+        """Classes of the impacts (A, B, C), as indices of `OUTCOMES`: which corners
+        leave.
 
         A corner leaves if its gamma+ > `separation_threshold` |gamma_B-|.
 
-        rest: none; rocking: A only, the block goes on about B; half-rocking: B only, it turns
-        back about A; free: both; unresolved: the law failed.
+        rest: none; rocking: A only, the block goes on about B; half-rocking: B only, it
+        turns back about A; free: both; unresolved: the law failed.
         """
         leaves = np.asarray(self.gap_velocity) > separation_threshold  # last axis: B, A
-        codes = leaves[..., 1] + 2 * leaves[..., 0]  # 0 none, 1 A only, 2 B only, 3 both
+        # 0 none, 1 A only, 2 B only, 3 both
+        codes = leaves[..., 1] + 2 * leaves[..., 0]
         unresolved = OUTCOMES.index("unresolved")
-        return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), unresolved, codes)
+        return np.where(
+            np.isnan(np.asarray(self.gap_velocity[..., 0])), unresolved, codes
+        )
 
     def __str__(self) -> str:
-        """Report: for each mu the critical angle and the numbers of impacts of each class."""
-        theta, outcomes = np.degrees(self.kinetic_angle), self.outcomes()
+        """Report: for each mu the critical angle and the numbers of impacts of each
+        class.
+        """
+        theta = np.degrees(self.kinetic_angle)
+        outcomes = self.outcomes()
         lines = [
-            f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} degrees "
+            f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} "
+            f"degrees "
             f"({len(theta)} shapes), {len(self.restitution)} e"
         ]
         for j, mu in enumerate(np.asarray(self.friction)):
             counts = np.bincount(outcomes[:, j].ravel(), minlength=len(OUTCOMES))
             shares = ", ".join(f"{n} {name}" for name, n in zip(OUTCOMES, counts) if n)
             critical = float(np.degrees(critical_kinetic_angle(mu)))
-            lines.append(f"mu = {mu:g}: critical angle {critical:.2f} degrees; {shares}")
+            lines.append(
+                f"mu = {mu:g}: critical angle {critical:.2f} degrees; {shares}"
+            )
         return "\n".join(lines)
 
 
 def rocking_kinetic_angle(aspect: Any) -> jax.Array:
-    """theta_12 [rad] of a homogeneous block flat on the ground, between its two corners.
+    """theta_12 [rad] of a homogeneous block on the ground, between two corners.
 
-    Equation: `cos(theta_12) = -(a^2 - 2) / (a^2 + 4)`, a = height / width: pi / 3 flat, pi slender.
+    Equation: `cos(theta_12) = -(a^2 - 2) / (a^2 + 4)`, a = height / width: pi / 3 flat,
+    pi slender.
 
     Args:
         aspect: a = height / width > 0, scalar or array.
@@ -212,13 +234,14 @@ def rocking_kinetic_angle(aspect: Any) -> jax.Array:
 
 
 def critical_kinetic_angle(friction: Any) -> jax.Array:
-    """Kinetic angle [rad] at which the hit at B leaves corner A alone: the tip of the V.
+    """Kinetic angle [rad] at which the hit at B leaves corner A alone.
 
-    Equation: B alone is pressed, slips at mu < 3 a / (4 a^2 + 1) and sticks otherwise; A gets no
-    acceleration where `a^2 - 2 + 3 mu a = 0`, or where it sticks at `2 a^2 = 1`, Housner's zero:
-    `a_c = (sqrt(9 mu^2 + 8) - 3 mu) / 2` for mu <= 1 / sqrt(2), else 1 / sqrt(2). No restitution,
-    stiffness or exponent is in it. Above a_c, `gamma_B+ = e`, `gamma_A+ = (1 + e) r` in units of
-    the approach, `r = (a^2 - 2 + 3 mu a) / (a^2 + 4 - 3 mu a)` slipping, Housner's value sticking.
+    Equation: B alone is pressed, slips at mu < 3 a / (4 a^2 + 1) and sticks otherwise;
+    A gets no acceleration where `a^2 - 2 + 3 mu a = 0`, or where it sticks at
+    `2 a^2 = 1`, Housner's zero: `a_c = (sqrt(9 mu^2 + 8) - 3 mu) / 2` for mu <= 1 /
+    sqrt(2), else 1 / sqrt(2). No restitution, stiffness or exponent is in it. Above
+    a_c, `gamma_B+ = e`, `gamma_A+ = (1 + e) r` in units of the approach,
+    `r = (a^2 - 2 + 3 mu a) / (a^2 + 4 - 3 mu a)` slipping, Housner's value sticking.
 
     Args:
         friction: mu >= 0, scalar or array.
@@ -229,10 +252,14 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     Raises:
         ValueError: friction < 0.
 
-    Source: own derivation; Brogliato (2016), section 6.3.2.2, shows the angle in a figure only.
+    Source: own derivation; Brogliato (2016), section 6.3.2.2, shows the angle in a
+    figure only.
 
     >>> import jimpact as ji
-    >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
+    >>> [
+    ...     round(float(ji.theory.critical_kinetic_angle(mu)), 4)
+    ...     for mu in (0.0, 0.3, 1.0)
+    ... ]
     [1.5708, 1.3862, 1.231]
     """
     mu = as_numbers("friction", friction, low=0.0)
@@ -241,7 +268,9 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
 
 
 class _BlockImpacts(NamedTuple):
-    """Outcomes of blocks of width 1 that turn with theta'- = -1 about A, gamma_B- = -1."""
+    """Outcomes of blocks of width 1 that turn with theta'- = -1 about A, gamma_B- =
+    -1.
+    """
 
     gap_velocity: jax.Array  # gamma+ (n, 2) of B and A
     angular_ratio: jax.Array  # theta'+ / theta'- (n,)
@@ -252,10 +281,11 @@ class _BlockImpacts(NamedTuple):
 
 @precise_jit
 def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> _BlockImpacts:
-    """Outcomes of blocks (n,) of width 1, height a, friction mu and restitution e by a law.
+    """Outcomes of blocks (n,) of width 1, height a, friction mu and restitution e by a
+    law.
 
-    The block turns about its corner A with theta'- = -1 and hits with B: v- = (a/2, -1/2, -1).
-    Values are NaN where the law fails.
+    The block turns about its corner A with theta'- = -1 and hits with B: v- = (a/2,
+    -1/2, -1). Values are NaN where the law fails.
     """
 
     def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> _BlockImpacts:
@@ -263,9 +293,12 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> _BlockImpac
         scene = Block(jnp.ones_like(a), a, jnp.ones_like(a), corners="base").scene()
         before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
         out = impact(
-            eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e)), scene, before
+            eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e)),
+            scene,
+            before,
         )
-        after, energy = out.velocity, (before**2 * scene.mass).sum() / 2
+        after = out.velocity
+        energy = (before**2 * scene.mass).sum() / 2
         return _BlockImpacts(
             gap_velocity=scene.normals.T @ after,
             angular_ratio=-after[2],
@@ -290,23 +323,25 @@ def rocking_dispersion(
     exponent: Any = 1.5,
     rtol: float | None = None,
 ) -> RockingDispersion:
-    """A block at theta = 0 that rocks about A and hits with B, by LZB with Coulomb friction.
+    """A block that rocks about A and hits with B, by LZB with Coulomb friction.
 
-    Equation: `(gamma_B-, gamma_A-) = (-1, 0)`, no slip before; `d = y_A'+ / y_B'-` is 0 at the
-    critical angle (`critical_kinetic_angle`) and grows in size on either side of it: a V.
+    Equation: `(gamma_B-, gamma_A-) = (-1, 0)`, no slip before; `d = y_A'+ / y_B'-` is 0
+    at the critical angle (`critical_kinetic_angle`) and grows in size on either side of
+    it: a V.
 
     Args:
         aspect: a = height / width > 0, scalar or (A,).
         friction: mu >= 0, scalar or (B,), of both corners.
-        restitution: energetic e in [0, 1], scalar or (C,), of both corners. At e = 0 no corner
-            rebounds, and left of the critical angle d = 0: half a V.
+        restitution: energetic e in [0, 1], scalar or (C,), of both corners. At e = 0 no
+            corner rebounds, and left of the critical angle d = 0: half a V.
         stiffness: of the corners, scalar or (2,) for B and A.
         exponent: 1 linear, 1.5 Hertz.
         rtol: as in `LZB`.
 
     Returns:
-        `RockingDispersion` over all combinations (A, B, C); NaN where LZB fails: `max_steps`, for a
-        few wide blocks left of the critical angle with e below about 0.1.
+        `RockingDispersion` over all combinations (A, B, C); NaN where LZB fails:
+        `max_steps`, for a few wide blocks left of the critical angle with e below about
+        0.1.
 
     Raises:
         ValueError: arguments out of range or with more than one axis.
@@ -320,7 +355,8 @@ def rocking_dispersion(
     ...
     ValueError: Argument `aspect` must lie in (0, inf), but has value -1 at index 0.
     """
-    a, mu = as_axis("aspect", aspect), as_axis("friction", friction)
+    a = as_axis("aspect", aspect)
+    mu = as_axis("friction", friction)
     e = as_axis("restitution", restitution)
     check_values("aspect", a, low=0.0, open_low=True)
     check_values("friction", mu, low=0.0)
@@ -336,10 +372,11 @@ def rocking_dispersion(
 def search_critical_angle(
     friction: Any, restitution: Any, stiffness: Any = 1.0, exponent: Any = 1.5
 ) -> jax.Array:
-    """The kinetic angle [rad] at which |d| is least, by impacts alone: for all (B, C) of mu and e.
+    """The kinetic angle [rad] at which |d| is least, by impacts alone.
 
-    Grids over 0.5 <= a <= 2, each around the best point of the previous one; to about 1e-7 where
-    e > 0 (at e = 0 there is no minimum). Arguments as in `rocking_dispersion`.
+    Grids over 0.5 <= a <= 2, each around the best point of the previous one; to about
+    1e-7 where e > 0 (at e = 0 there is no minimum). Arguments as in
+    `rocking_dispersion`.
 
     Args:
         friction: mu >= 0, scalar or (B,).
@@ -359,14 +396,16 @@ def search_critical_angle(
     >>> ji.theory.search_critical_angle(0.1, -0.5)
     Traceback (most recent call last):
     ...
-    ValueError: Argument `restitution` must lie in (0, 1], but has value -0.5 at index 0.
+    ValueError: Argument `restitution` must lie in (0, 1], but has value -0.5 ...
     """
-    mu, e = as_axis("friction", friction), as_axis("restitution", restitution)
+    mu = as_axis("friction", friction)
+    e = as_axis("restitution", restitution)
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0, open_low=True)
     law = LZB(1.0, stiffness, exponent, friction=0.0)
     mus, es = (x.ravel() for x in jnp.meshgrid(mu, e, indexing="ij"))
-    low, high = jnp.full_like(mus, 0.5), jnp.full_like(mus, 2.0)
+    low = jnp.full_like(mus, 0.5)
+    high = jnp.full_like(mus, 2.0)
     for _ in range(_ZOOMS):
         a = jnp.linspace(low, high, _POINTS, axis=1)
         each_mu, each_e = (jnp.repeat(x, _POINTS) for x in (mus, es))
@@ -374,15 +413,16 @@ def search_critical_angle(
         size = jnp.abs(gamma[:, 1]).reshape(a.shape)  # |d| = |gamma_A+|
         best = jnp.take_along_axis(a, jnp.nanargmin(size, axis=1)[:, None], 1)[:, 0]
         step = (high - low) / (_POINTS - 1)
-        low, high = best - step, best + step
+        low = best - step
+        high = best + step
     return rocking_kinetic_angle(best).reshape(len(mu), len(e))
 
 
 class RockingDomain(NamedTuple):
     """Admissible `E = [[own, cross], [cross, own]]` of a block flat on the ground.
 
-    `aspect`, `sliding`; `coupling` g: G = [[1, g], [g, 1]]; `corners` (k, 2): the vertices of the
-    domain in the plane (own, cross).
+    `aspect`, `sliding`; `coupling` g: G = [[1, g], [g, 1]]; `corners` (k, 2): the
+    vertices of the domain in the plane (own, cross).
     """
 
     aspect: float
@@ -391,38 +431,51 @@ class RockingDomain(NamedTuple):
     corners: np.ndarray
 
     def contains(self, own: Any, cross: Any) -> np.ndarray:
-        """True for admissible entries `own` and `cross`, ends included; arrays broadcast.
+        """True for admissible entries `own` and `cross`, ends included; arrays
+        broadcast.
 
         Equation: `own >= 0`, `cross >= 0`, `own + cross <= 1`, `cross >= g (1 + own)`.
         """
-        a, b = np.asarray(own, float), np.asarray(cross, float)
-        inside: np.ndarray = (a >= 0) & (b >= 0) & (a + b <= 1) & (b >= self.coupling * (1 + a))
+        a = np.asarray(own, float)
+        b = np.asarray(cross, float)
+        inside: np.ndarray = (
+            (a >= 0) & (b >= 0) & (a + b <= 1) & (b >= self.coupling * (1 + a))
+        )
         return inside
 
     @property
     def rocking(self) -> tuple[float, float]:
-        """Least and largest `cross` at own = 0: the corner that hits stays, the other leaves."""
+        """Least and largest `cross` at own = 0: the corner that hits stays, the other
+        leaves.
+        """
         return max(self.coupling, 0.0), 1.0
 
     @property
     def half_rocking(self) -> tuple[float, float] | None:
-        """Least and largest `own` at cross = 0: the corner that hits leaves, the other stays."""
-        return (0.0, 1.0) if self.coupling <= 0 else None
+        """Least and largest `own` at cross = 0: the corner that hits leaves, the other
+        stays.
+        """
+        if self.coupling <= 0:
+            return (0.0, 1.0)
+        return None
 
 
 def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
-    """Restitution matrices of a homogeneous block, alike at both corners, that mechanics allows.
+    """Restitution matrices of a homogeneous block that mechanics allows.
 
-    Equation: with `E = [[a, b], [b, a]]` for (qn_1, qn_2), where a corner hits alone it returns a
-    of its velocity and the other one gets b of it. Prop. 6.2: a, b >= 0 and `b >= g (1 + a)`;
-    Prop. 6.4: `a + b <= 1`. Free (both corners leave): a, b > 0; half-rocking (it turns back
-    about the same corner): b = 0; rocking (from corner to corner): a = 0.
-    `g = (A^2 - 2) / (A^2 + 4)` of the aspect A where both corners slide without friction, and
-    Housner's value `(2 A^2 - 1) / (2 A^2 + 2)` where they stick before and after.
+    Equation: with `E = [[a, b], [b, a]]` for (qn_1, qn_2), where a corner hits alone it
+    returns a of its velocity and the other one gets b of it. Prop. 6.2: a, b >= 0 and
+    `b >= g (1 + a)`; Prop. 6.4: `a + b <= 1`. Free (both corners leave): a, b > 0;
+    half-rocking (it turns back about the same corner): b = 0; rocking (from corner to
+    corner): a = 0.
+    `g = (A^2 - 2) / (A^2 + 4)` of the aspect A where both corners slide without
+    friction, and Housner's value `(2 A^2 - 1) / (2 A^2 + 2)` where they stick before
+    and after.
 
     Args:
         aspect: A = height / width > 0.
-        sliding: True: without tangential impulses (E_33 = -1); False: both corners stick.
+        sliding: True: without tangential impulses (E_33 = -1); False: both corners
+            stick.
 
     Returns:
         `RockingDomain`.
@@ -432,18 +485,24 @@ def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
 
     Host function, not differentiable.
 
-    Source: own derivation from Brogliato (2016), Props. 6.2 and 6.4; the admissible entries of the
-    source's reference [228] were not at hand.
+    Source: own derivation from Brogliato (2016), Props. 6.2 and 6.4; the admissible
+    entries of the source's reference [228] were not at hand.
 
     >>> import jimpact as ji
     >>> domain = ji.theory.rocking_domain(2.0)
-    >>> domain.corners.round(4).tolist()  # slender: it never turns back about the same corner
+    >>> domain.corners.round(
+    ...     4
+    ... ).tolist()  # slender: it never turns back about the same corner
     [[0.0, 0.25], [0.6, 0.4], [0.0, 1.0]]
     >>> domain.half_rocking, ji.theory.rocking_domain(2.0, sliding=False).rocking
     (None, (0.7, 1.0))
     """
     a = float(as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True))
-    g = (a**2 - 2) / (a**2 + 4) if sliding else float(housner_restitution(a))
-    wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]  # a, b >= 0, a + b <= 1, cut by b = g (1 + a)
+    if sliding:
+        g = (a**2 - 2) / (a**2 + 4)
+    else:
+        g = float(housner_restitution(a))
+    # a, b >= 0, a + b <= 1, cut by b = g (1 + a)
+    wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
     slender = [[0.0, g], [(1 - g) / (1 + g), 2 * g / (1 + g)], [0.0, 1.0]]
     return RockingDomain(a, sliding, g, np.array(wide if g <= 0 else slender))

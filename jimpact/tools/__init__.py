@@ -1,1 +1,3 @@
-"""Tools that know no mechanics: checks of arguments, compiling, tables, progress, statuses."""
+"""Tools that know no mechanics: checks of arguments, compiling, tables, progress,
+statuses.
+"""

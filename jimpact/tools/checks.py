@@ -25,17 +25,20 @@ def needed(module: str, how: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"{module} must be installed for this, but is not: {how}.") from error
+        raise ImportError(
+            f"{module} must be installed for this, but is not: {how}."
+        ) from error
 
 
 @contextmanager
 def missing_room(name: str) -> Iterator[None]:
-    """A room that this copy of the package lacks becomes an ImportError that says so of `name`.
+    """A room that this copy of the package lacks becomes an ImportError that says so of
+    `name`.
 
     >>> with missing_room("ji.monte_carlo"):
     ...     importlib.import_module("jimpact.montekarlo")
     Traceback (most recent call last):
-    ImportError: ji.monte_carlo needs the room jimpact/montekarlo, which is missing here.
+    ImportError: ji.monte_carlo needs the room jimpact/montekarlo, ...
     """
     try:
         yield
@@ -49,7 +52,9 @@ def missing_room(name: str) -> Iterator[None]:
 
 
 def is_traced(value: Any) -> bool:
-    """True where `value` is (or holds) an abstract value inside a JAX transformation."""
+    """True where `value` is (or holds) an abstract value inside a JAX
+    transformation.
+    """
     if "jax" not in sys.modules:
         return False
     import jax
@@ -58,15 +63,25 @@ def is_traced(value: Any) -> bool:
 
 
 def _not_numeric(name: str, value: Any, kind: str = "") -> TypeError:
-    """The TypeError for a value that is no array of real numbers; `kind`: letter of its dtype."""
+    """The TypeError for a value that is no array of real numbers; `kind`: letter of its
+    dtype.
+    """
     what = {
         "c": "must be real, but is complex",
-        "M": "must be numbers, but holds dates: give seconds, (t - t[0]) / np.timedelta64(1, 's')",
-        "m": "must be numbers, but holds durations: give seconds, t / np.timedelta64(1, 's')",
+        "M": (
+            "must be numbers, but holds dates: give seconds, (t - t[0]) / "
+            "np.timedelta64(1, 's')"
+        ),
+        "m": (
+            "must be numbers, but holds durations: give seconds, t / "
+            "np.timedelta64(1, 's')"
+        ),
     }
     if kind in what:
         return TypeError(f"Argument `{name}` {what[kind]}.")
-    return TypeError(f"Argument `{name}` must be numeric, but has value {short_repr(value)}.")
+    return TypeError(
+        f"Argument `{name}` must be numeric, but has value {short_repr(value)}."
+    )
 
 
 def _on_host(name: str, value: Any) -> np.ndarray:
@@ -75,7 +90,8 @@ def _on_host(name: str, value: Any) -> np.ndarray:
         host = np.asarray(value)
     except ValueError:  # rows of different lengths
         raise ValueError(
-            f"Argument `{name}` must be an array, whose rows are equally long, but has value "
+            f"Argument `{name}` must be an array, whose rows are equally long, but has "
+            f"value "
             f"{short_repr(value)}."
         ) from None
     if host.dtype.kind not in "fiubV":  # V: the short floats of JAX
@@ -84,7 +100,9 @@ def _on_host(name: str, value: Any) -> np.ndarray:
 
 
 def as_float_array(name: str, value: Any) -> "jax.Array":
-    """`value` as a floating JAX array; text, truth values, objects, complex numbers are refused."""
+    """`value` as a floating JAX array; text, truth values, objects, complex numbers are
+    refused.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -114,7 +132,9 @@ def as_numbers(
     high: float = np.inf,
     open_low: bool = False,
 ) -> "jax.Array":
-    """`value` as a floating JAX array, checked: its shape or one entry a contact, and its range."""
+    """`value` as a floating JAX array, checked: its shape or one entry a contact, and
+    its range.
+    """
     array = as_float_array(name, value)
     if shape is not None:
         check_shape(name, array, shape, meaning)
@@ -125,11 +145,14 @@ def as_numbers(
 
 
 def as_axis(name: str, value: Any) -> "jax.Array":
-    """`value`, a scalar or with one axis, as a floating JAX array with one axis, not empty."""
+    """`value`, a scalar or with one axis, as a floating JAX array with one axis, not
+    empty.
+    """
     array = as_float_array(name, value)
     if array.ndim > 1 or array.size == 0:
         raise ValueError(
-            f"Argument `{name}` must be a scalar or have one axis, but has shape {array.shape}."
+            f"Argument `{name}` must be a scalar or have one axis, but has shape "
+            f"{array.shape}."
         )
     return array.reshape(-1)
 
@@ -143,7 +166,9 @@ def check_values(
     open_low: bool = False,
     nan_allowed: bool = False,
 ) -> None:
-    """Raise a ValueError unless all entries lie between `low` and `high`; TypeError: no numbers."""
+    """Raise a ValueError unless all entries lie between `low` and `high`; TypeError: no
+    numbers.
+    """
     if value is None or is_traced(value):
         return
     entries = _on_host(name, value).astype(float)
@@ -153,22 +178,36 @@ def check_values(
     if not bad.any():
         return
     index = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
-    where = f" at index {index[0] if len(index) == 1 else index}" if entries.ndim else ""
-    bracket = "(" if open_low else "["
-    allowed = (
-        f"lie in {bracket}{low:g}, {high:g}{']' if np.isfinite(high) else ')'}"
-        if np.isfinite(low) or np.isfinite(high)
-        else "be finite"
-    )
+    if entries.ndim:
+        where = f" at index {index[0] if len(index) == 1 else index}"
+    else:
+        where = ""
+    if open_low:
+        bracket = "("
+    else:
+        bracket = "["
+    if np.isfinite(low) or np.isfinite(high):
+        allowed = (
+            f"lie in {bracket}{low:g}, {high:g}{']' if np.isfinite(high) else ')'}"
+        )
+    else:
+        allowed = "be finite"
     raise ValueError(
-        f"Argument `{name}` must {allowed}, but has value {np.atleast_1d(entries)[index]:g}{where}."
+        f"Argument `{name}` must {allowed}, but has value "
+        f"{np.atleast_1d(entries)[index]:g}{where}."
     )
 
 
 def as_whole(name: str, value: Any, low: int) -> int:
     """`value` as an int; raise a ValueError unless it is one of at least `low`."""
-    if isinstance(value, bool) or not hasattr(value, "__index__") or operator.index(value) < low:
-        raise ValueError(f"Argument `{name}` must be an int >= {low}, but has value {value!r}.")
+    if (
+        isinstance(value, bool)
+        or not hasattr(value, "__index__")
+        or operator.index(value) < low
+    ):
+        raise ValueError(
+            f"Argument `{name}` must be an int >= {low}, but has value {value!r}."
+        )
     return operator.index(value)
 
 
@@ -183,7 +222,9 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
 
 
 def check_word(what: str, word: Any, choices: Iterable[Any]) -> None:
-    """Raise a ValueError that begins with `what` unless the word is one of `choices`."""
+    """Raise a ValueError that begins with `what` unless the word is one of
+    `choices`.
+    """
     if word not in choices:
         known = ", ".join(map(str, choices))
         raise ValueError(
@@ -193,13 +234,20 @@ def check_word(what: str, word: Any, choices: Iterable[Any]) -> None:
 
 
 # What parameters are called in papers.
-ABBREVIATIONS = {"e": "restitution", "k": "stiffness", "mu": "friction", "eta": "exponent"}
+ABBREVIATIONS = {
+    "e": "restitution",
+    "k": "stiffness",
+    "mu": "friction",
+    "eta": "exponent",
+}
 
 
 def suggestion(
     word: Any, choices: Iterable[Any], abbreviations: Mapping[str, str] | None = None
 ) -> str:
-    """' Did you mean X?' for the choice that is spelled most like the word, '' if none is alike."""
+    """' Did you mean X?' for the choice that is spelled most like the word, '' if none
+    is alike.
+    """
     import difflib
 
     known = {str(x).lower(): x for x in choices}
@@ -207,7 +255,9 @@ def suggestion(
     if full in known:
         return f" Did you mean {known[full]}?"
     close = difflib.get_close_matches(str(word).lower(), known, n=1)
-    return f" Did you mean {known[close[0]]}?" if close else ""
+    if close:
+        return f" Did you mean {known[close[0]]}?"
+    return ""
 
 
 _MOST_NUMBERS = 8  # of an array that are printed
@@ -229,7 +279,9 @@ def in_numbers(values: Any) -> str:
     if array.ndim == 0:
         return f"{array.item():.6g}"
     if array.dtype.kind == "f" and array.size:
-        array = np.where(np.abs(array) <= _ROUNDING * np.nanmax(np.abs(array)), 0.0, array)
+        array = np.where(
+            np.abs(array) <= _ROUNDING * np.nanmax(np.abs(array)), 0.0, array
+        )
     numbers = [f"{x:.6g}" for x in array.ravel()[:_MOST_NUMBERS].tolist()]
     if array.size > _MOST_NUMBERS:
         numbers.append(f"...; {array.size} in all")
@@ -237,7 +289,9 @@ def in_numbers(values: Any) -> str:
 
 
 def check_kind(name: str, value: Any, kind: type, call: str = "") -> None:
-    """Raise a TypeError unless `value` is an instance of `kind`; it shows the `call`, if given."""
+    """Raise a TypeError unless `value` is an instance of `kind`; it shows the `call`,
+    if given.
+    """
     if isinstance(value, kind):
         return
     hint = ""
@@ -250,30 +304,42 @@ def check_kind(name: str, value: Any, kind: type, call: str = "") -> None:
     elif hasattr(kind, "_instead_of"):
         hint = kind._instead_of(value)
     raise TypeError(
-        f"Argument `{name}` must be of type {kind.__name__}, but is {short_repr(value)}.{hint}"
+        f"Argument `{name}` must be of type {kind.__name__}, but is "
+        f"{short_repr(value)}.{hint}"
     )
 
 
 def check_function(name: str, value: Any) -> None:
     """Raise a TypeError unless `value` can be called."""
     if not callable(value):
-        raise TypeError(f"Argument `{name}` must be a function, but is {short_repr(value)}.")
+        raise TypeError(
+            f"Argument `{name}` must be a function, but is {short_repr(value)}."
+        )
 
 
 def short_repr(value: Any) -> str:
-    """The value as messages show it: its type where it takes more than 80 characters."""
+    """The value as messages show it: its type where it takes more than 80
+    characters.
+    """
     text = repr(value)
     kind = type(value).__name__
-    article = "an" if kind[0] in "AEIOaeio" else "a"
-    return text if "\n" not in text and len(text) < 80 else f"{article} {kind}"
+    if kind[0] in "AEIOaeio":
+        article = "an"
+    else:
+        article = "a"
+    if "\n" not in text and len(text) < 80:
+        return text
+    return f"{article} {kind}"
 
 
 def check_concrete(name: str, value: Any) -> None:
     """Raise a TypeError where `value` is traced: what a fit needs are numbers."""
     if is_traced(value):
         raise TypeError(
-            f"Argument `{name}` must hold numbers, but is traced: fits run on the host, not under "
-            "jit, vmap or grad. For these, `FitProblem.residual` and `jacobian` are pure functions "
+            f"Argument `{name}` must hold numbers, but is traced: fits run on the "
+            f"host, not under "
+            "jit, vmap or grad. For these, `FitProblem.residual` and `jacobian` are "
+            "pure functions "
             "of the parameters."
         )
 
@@ -291,14 +357,17 @@ def check_square(name: str, value: Any) -> None:
     """Raise a ValueError unless `value` is a square matrix."""
     shape = np.shape(value)
     if len(shape) != 2 or shape[0] != shape[1]:
-        raise ValueError(f"Argument `{name}` must be a square matrix, but has shape {shape}.")
+        raise ValueError(
+            f"Argument `{name}` must be a square matrix, but has shape {shape}."
+        )
 
 
 def check_per_contact(name: str, value: Any, contacts: int) -> None:
     """Raise a ValueError unless `value` is a scalar or has one entry per contact."""
     if np.shape(value) not in ((), (contacts,)):
         raise ValueError(
-            f"Argument `{name}` must be a scalar or have shape ({contacts},), one value per "
+            f"Argument `{name}` must be a scalar or have shape ({contacts},), one "
+            f"value per "
             f"contact, but has shape {tuple(np.shape(value))}."
         )
 
@@ -313,7 +382,9 @@ def in_common_dtype(*trees: Any) -> Any:
     if len({x.dtype for x in leaves}) == 1:
         return trees
     dtype = jnp.result_type(*leaves)
-    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)
+    return jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees
+    )
 
 
 def check_executor(executor: Any) -> None:
@@ -323,6 +394,7 @@ def check_executor(executor: Any) -> None:
         known = executor in EXECUTORS or ":" in executor  # host and port of a scheduler
     if not known:
         raise ValueError(
-            f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address of a Dask "
+            f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address "
+            f"of a Dask "
             f"scheduler, or an object with a method `map`, but is {executor!r}."
         )

@@ -13,8 +13,8 @@ import numpy as np
 
 from jimpact.tools.kept_programs import keeper
 
-# XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
-# take twice as long to compile a program of many small loops.
+# XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large
+# batches, and take twice as long to compile a program of many small loops.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -23,10 +23,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def full_precision(function: Function) -> Function:
     """`function`, whose products of matrices have the precision of their numbers.
 
-    By default JAX lets accelerators multiply float32 matrices with 10 bits (TF32, bfloat16): laws
-    are wrong by 5e-4 then, and error estimates never reach a tolerance. A product gets its
-    precision where it is traced, so this decorates whatever JAX may trace by itself: public
-    functions and methods, compiled programs, rules of derivatives.
+    By default JAX lets accelerators multiply float32 matrices with 10 bits (TF32,
+    bfloat16): laws are wrong by 5e-4 then, and error estimates never reach a tolerance.
+    A product gets its precision where it is traced, so this decorates whatever JAX may
+    trace by itself: public functions and methods, compiled programs, rules of
+    derivatives.
     """
 
     @functools.wraps(function)
@@ -50,17 +51,21 @@ def known_options() -> dict[str, Any]:
 
 @functools.cache
 def _probe() -> Callable[..., Any]:
-    """A program that does nothing, with compiler options: JAX refuses them inside another one."""
+    """A program that does nothing, with compiler options: JAX refuses them inside
+    another one.
+    """
     return jax.jit(lambda *x: x, compiler_options=known_options())
 
 
 def is_top_level_call(*args: Any) -> bool:
-    """True where a program called with these arguments now is compiled and run by itself.
+    """True where a program called with these arguments now is compiled and run by
+    itself.
 
-    It is not where it becomes part of another program: under jit, in loops, in reverse mode.
-    Forward mode and vmap run it at once. JAX has no public question for it, but it refuses
-    compiler options (ValueError) of a program that becomes part of another one: a probe that does
-    nothing is called with those of the arguments that are traced.
+    It is not where it becomes part of another program: under jit, in loops, in reverse
+    mode. Forward mode and vmap run it at once. JAX has no public question for it, but
+    it refuses compiler options (ValueError) of a program that becomes part of another
+    one: a probe that does nothing is called with those of the arguments that are
+    traced.
     """
     traced = [x for x in jax.tree.leaves(args) if isinstance(x, jax.core.Tracer)]
     try:
@@ -71,7 +76,9 @@ def is_top_level_call(*args: Any) -> bool:
 
 
 def precise_jit(function: Function) -> Function:
-    """`eqx.filter_jit(function)` in full precision; kept programs are loaded (`kept_programs`)."""
+    """`eqx.filter_jit(function)` in full precision; kept programs are loaded
+    (`kept_programs`).
+    """
     return _compiled(function, dict, _Results.of, _Results.joined)
 
 
@@ -91,17 +98,22 @@ def _compiled(
     Args:
         function: to be compiled.
         options: of the compiler, where called at top level.
-        packed: the results of the function as those of a program, all leaves of which are arrays.
+        packed: the results of the function as those of a program, all leaves of which
+            are arrays.
         unpacked: the inverse.
     """
     inside = eqx.filter_jit(function)
 
     @functools.cache
     def program(name: str = function.__name__) -> Any:
-        """The function of (structure, other leaves), arrays, to be compiled under a name."""
+        """The function of (structure, other leaves), arrays, to be compiled under a
+        name.
+        """
 
         def of_arrays(rest: Any, arrays: list[Any]) -> Any:
-            """`function` of flattened arguments: `rest` is (structure, other leaves)."""
+            """`function` of flattened arguments: `rest` is (structure, other
+            leaves).
+            """
             tree, fixed = rest
             values = iter(arrays)
             leaves = [next(values) if x is None else x[0] for x in fixed]
@@ -115,20 +127,27 @@ def _compiled(
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
         """`function`, compiled by itself or as part of the program that calls it."""
-        if (keeper() is None and options is dict) or not is_top_level_call(args, keywords):
+        if (keeper() is None and options is dict) or not is_top_level_call(
+            args, keywords
+        ):
             return inside(*args, **keywords)
         leaves, tree = jax.tree.flatten((args, keywords))
         fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
         arrays = [x for x in leaves if eqx.is_array(x)]
         kept = _kept(function, program, fixed, arrays)
-        results = program()(fixed, arrays) if kept is None else kept(arrays)
+        if kept is None:
+            results = program()(fixed, arrays)
+        else:
+            results = kept(arrays)
         return unpacked(results)
 
     return call  # type: ignore[return-value]
 
 
 class _Results(eqx.Module):
-    """The results of a program: arrays, and what is no array as part of the structure."""
+    """The results of a program: arrays, and what is no array as part of the
+    structure.
+    """
 
     arrays: Any
     others: Any = eqx.field(static=True)

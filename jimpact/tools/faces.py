@@ -1,4 +1,6 @@
-"""Faces: packages that hand on names of other rooms, as `ji.plot` does, when one is asked for."""
+"""Faces: packages that hand on names of other rooms, as `ji.plot` does, when one is
+asked for.
+"""
 
 import ast
 from collections.abc import Callable
@@ -9,11 +11,14 @@ from typing import Any
 from jimpact.tools.checks import missing_room
 
 
-def face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package whose stub, beside its `file`, states all names.
+def face(
+    package: str, file: str
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package whose stub, beside its `file`, states
+    all names.
 
-    `lazy_loader` does the same for packages whose names are all their own. A name whose room is
-    missing is an ImportError that says so.
+    `lazy_loader` does the same for packages whose names are all their own. A name whose
+    room is missing is an ImportError that says so.
 
     >>> from jimpact.tools.faces import face
     >>> import jimpact.plot
@@ -38,7 +43,9 @@ def face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], li
 
 
 def _modules_of_names(package: str, stub: Path) -> dict[str, str]:
-    """The module of each name that a stub states: `from .module import` or `from room.module`."""
+    """The module of each name that a stub states: `from .module import` or
+    `from room.module`.
+    """
     body = ast.parse(stub.read_text(encoding="utf-8")).body
     lines = [line for line in body if isinstance(line, ast.ImportFrom)]
     return {

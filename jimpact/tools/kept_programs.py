@@ -1,9 +1,11 @@
-"""Compiled programs in a folder: a later process loads them, and neither traces nor compiles.
+"""Compiled programs in a folder: a later process loads them, and neither traces nor
+compiles.
 
-A program is found by all that determines it: the sources of jimpact, the versions of jax, jaxlib
-and equinox, the processor, JAX's settings, the function, the shapes of its arrays and everything
-in its arguments that is no array. What cannot be named so (a user's own functions and classes) is
-not kept. A file that is damaged, or of another user, counts as none: the program is compiled anew.
+A program is found by all that determines it: the sources of jimpact, the versions of
+jax, jaxlib and equinox, the processor, JAX's settings, the function, the shapes of its
+arrays and everything in its arguments that is no array. What cannot be named so (a
+user's own functions and classes) is not kept. A file that is damaged, or of another
+user, counts as none: the program is compiled anew.
 """
 
 import dataclasses
@@ -31,8 +33,9 @@ from jax.experimental import serialize_executable
 from jimpact.tools.checks import check_kind, needed
 
 SUFFIX = ".program"
-# Bytes [B] that the files of a folder may take together; the ones not used for longest go first. An
-# impact takes 1 MB, a fit 3 MB: ten times less would hold a day's work of one study.
+# Bytes [B] that the files of a folder may take together; the ones not used for longest
+# go first. An impact takes 1 MB, a fit 3 MB: ten times less would hold a day's work of
+# one study.
 LARGEST = 1_000_000_000
 # Settings of JAX's that change a compiled program.
 SETTINGS = (
@@ -50,10 +53,20 @@ SETTINGS = (
     "jax_memory_fitting_effort",
     "jax_enable_checks",
 )
-OPTIONS_OF_XLA = ("XLA_FLAGS", "JAX_PLATFORMS", "LIBTPU_INIT_ARGS")  # of the environment
+# of the environment
+OPTIONS_OF_XLA = ("XLA_FLAGS", "JAX_PLATFORMS", "LIBTPU_INIT_ARGS")
 
 
-KNOWN = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "builtins", "functools", "collections")
+KNOWN = (
+    "jimpact",
+    "jax",
+    "jaxlib",
+    "equinox",
+    "numpy",
+    "builtins",
+    "functools",
+    "collections",
+)
 PROCESSOR = Path("/proc/cpuinfo")  # lists the instruction set
 CALLS = re.compile(r'custom_call_target="([^"]*)"')  # of functions outside of a program
 LAPACK = "lapack_"
@@ -64,15 +77,19 @@ Compiler: TypeAlias = Callable[[str], Program]  # of a name
 
 
 class Unnamed(Exception):
-    """A value that determines a program, and has no name that another process would give it."""
+    """A value that determines a program, and has no name that another process would
+    give it.
+    """
 
 
 class Keeper:
-    """A folder of compiled programs, and those that this process has loaded or compiled.
+    """A folder of compiled programs, and those that this process has loaded or
+    compiled.
 
     Attributes:
         folder: where the files are.
-        ground: what determines all programs: sources, versions, processor, settings of XLA.
+        ground: what determines all programs: sources, versions, processor, settings of
+            XLA.
         programs: by function and arguments; None where a program cannot be kept.
     """
 
@@ -83,9 +100,14 @@ class Keeper:
         self.programs: dict[Any, Program | None] = {}
 
     def program(
-        self, function: Callable[..., Any], compiled: Compiler, fixed: Any, arrays: Sequence[Any]
+        self,
+        function: Callable[..., Any],
+        compiled: Compiler,
+        fixed: Any,
+        arrays: Sequence[Any],
     ) -> Program | None:
-        """The compiled program of a function for these arguments: of the folder, or made anew.
+        """The compiled program of a function for these arguments: of the folder, or
+        made anew.
 
         Args:
             function: of jimpact, which names the program.
@@ -108,13 +130,21 @@ class Keeper:
         return self.programs[key]
 
     def _name(
-        self, function: Callable[..., Any], fixed: Any, kinds: tuple[Any, ...], settings: Any
+        self,
+        function: Callable[..., Any],
+        fixed: Any,
+        kinds: tuple[Any, ...],
+        settings: Any,
     ) -> str | None:
-        """Digest of all that determines a program; None where a part of it has no name."""
+        """Digest of all that determines a program; None where a part of it has no
+        name.
+        """
         tree, leaves = fixed
         if None in kinds or not _is_on_host():
             return None
-        places = [_Array(i) if leaf is None else leaf[0] for i, leaf in enumerate(leaves)]
+        places = [
+            _Array(i) if leaf is None else leaf[0] for i, leaf in enumerate(leaves)
+        ]
         try:
             named = name_of(jax.tree.unflatten(tree, places))
             name = _name_of_function(function)
@@ -125,11 +155,13 @@ class Keeper:
 
 
 class _KeptProgram:
-    """A program that is loaded from a file, or compiled and written to it, when it is called.
+    """A program that is loaded from a file, or compiled and written to it, when it is
+    called.
 
-    A program that JAX has loaded from its own cache may lack functions once it is written and
-    loaded again. So a program is written after it has run from the bytes of its file; if it cannot,
-    it is compiled under another name, by which JAX's cache does not find it.
+    A program that JAX has loaded from its own cache may lack functions once it is
+    written and loaded again. So a program is written after it has run from the bytes of
+    its file; if it cannot, it is compiled under another name, by which JAX's cache does
+    not find it.
     """
 
     def __init__(self, path: Path, arrays: int, compiled: Compiler):
@@ -158,7 +190,8 @@ class _KeptProgram:
         return program(arrays)
 
     def _tried(self, kept: "_Bytes", arrays: list[Any]) -> Any:
-        """The results by the program of these bytes, which is used from now on; None if it fails.
+        """The results by the program of these bytes, which is used from now on; None if
+        it fails.
 
         The results of programs are never None.
         """
@@ -182,7 +215,9 @@ _keeper: list[Keeper] = []  # none, or the one that `keep_programs` has set
 
 def keeper() -> Keeper | None:
     """The keeper that `keep_programs` has set; None: programs are not kept."""
-    return _keeper[0] if _keeper else None
+    if _keeper:
+        return _keeper[0]
+    return None
 
 
 class KeptPrograms(NamedTuple):
@@ -198,7 +233,9 @@ class KeptPrograms(NamedTuple):
     def __str__(self) -> str:
         """Folder, number and size."""
         size = sum(path.stat().st_size for path in self.files)
-        return f"{self.folder}: {len(self.files)} compiled programs, {size / 1e6:.1f} MB"
+        return (
+            f"{self.folder}: {len(self.files)} compiled programs, {size / 1e6:.1f} MB"
+        )
 
     def clear(self) -> None:
         """Remove all of them."""
@@ -209,12 +246,13 @@ class KeptPrograms(NamedTuple):
 def keep_programs(folder: str | Path | None = None) -> KeptPrograms:
     """Keep compiled programs in a folder, from which later processes load them.
 
-    A process that computes an impact, a fit or a motion as an earlier one did then neither traces
-    nor compiles: it starts in a quarter of the time. Results are the same to the last bit. Programs
-    of `jax.jit`, `vmap` and `grad` around jimpact's functions are JAX's own, and not kept; no
-    setting of JAX's is changed. What is kept belongs to this build of jimpact, JAX and the
-    processor; anything else, a damaged file or one of another user is compiled anew. A user's own
-    laws and functions are compiled as before. Only on the CPU, under Linux.
+    A process that computes an impact, a fit or a motion as an earlier one did then
+    neither traces nor compiles: it starts in a quarter of the time. Results are the
+    same to the last bit. Programs of `jax.jit`, `vmap` and `grad` around jimpact's
+    functions are JAX's own, and not kept; no setting of JAX's is changed. What is kept
+    belongs to this build of jimpact, JAX and the processor; anything else, a damaged
+    file or one of another user is compiled anew. A user's own laws and functions are
+    compiled as before. Only on the CPU, under Linux.
 
     Args:
         folder: where; it is created. None: the user's cache folder (platformdirs).
@@ -257,8 +295,9 @@ def keep_programs(folder: str | Path | None = None) -> KeptPrograms:
 def name_of(value: Any) -> str:
     """What a value is, in words that any process finds; `Unnamed` if there are none.
 
-    Numbers, words and collections of them; enumerations; arrays by their digest; functions and
-    classes of jimpact, JAX, Equinox and NumPy by their names; dataclasses by class and fields.
+    Numbers, words and collections of them; enumerations; arrays by their digest;
+    functions and classes of jimpact, JAX, Equinox and NumPy by their names; dataclasses
+    by class and fields.
     """
     kind = type(value)
     if value is None or kind in (bool, int, str, bytes, complex):
@@ -317,11 +356,15 @@ def _name_of_function(function: Any) -> str:
 
 
 def _kind_of_array(array: Any) -> tuple[Any, ...] | None:
-    """Shape, type and weakness of an array; None if it is not on one device of the default kind."""
+    """Shape, type and weakness of an array; None if it is not on one device of the
+    default kind.
+    """
     if isinstance(array, jax.Array):
         is_movable = len(array.devices()) == 1 and not array.committed
         weak = getattr(array, "weak_type", False)  # which random keys do not have
-        return (array.shape, array.dtype, weak) if is_movable else None
+        if is_movable:
+            return (array.shape, array.dtype, weak)
+        return None
     return array.shape, array.dtype, False
 
 
@@ -338,7 +381,9 @@ def _settings() -> tuple[Any, ...]:
 
 @functools.cache
 def _ground() -> str:
-    """Digest of what determines all programs: sources, versions, processor, options of XLA."""
+    """Digest of what determines all programs: sources, versions, processor, options of
+    XLA.
+    """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
@@ -383,20 +428,28 @@ class _Bytes(NamedTuple):
 
 
 def _serialized(compiled: Any) -> _Bytes | None:
-    """A compiled program as bytes; None where it calls functions other than those of LAPACK."""
+    """A compiled program as bytes; None where it calls functions other than those of
+    LAPACK.
+    """
     try:
-        if not all(call.startswith(LAPACK) for call in CALLS.findall(compiled.as_text())):
+        if not all(
+            call.startswith(LAPACK) for call in CALLS.findall(compiled.as_text())
+        ):
             return None
         payload, _, results = serialize_executable.serialize(compiled)
         skeleton = pickle.dumps(jax.tree.unflatten(results, range(results.num_leaves)))
         is_same = jax.tree.structure(pickle.loads(skeleton)) == results
     except Exception:  # results that hold functions, say
         return None
-    return _Bytes(payload, skeleton) if is_same else None
+    if is_same:
+        return _Bytes(payload, skeleton)
+    return None
 
 
 def _read(path: Path) -> _Bytes | None:
-    """The program of a file; None if there is none, or one that is not to be trusted."""
+    """The program of a file; None if there is none, or one that is not to be
+    trusted.
+    """
     try:
         if not (_is_own(path) and _is_own(path.parent)):
             return None
@@ -434,7 +487,8 @@ def _write(path: Path, kept: _Bytes) -> None:
 
 @functools.cache
 def _load_lapack() -> None:
-    """Let JAX look up the functions of LAPACK, which it does where a call of one is lowered.
+    """Let JAX look up the functions of LAPACK, which it does where a call of one is
+    lowered.
 
     A program that is loaded calls them all the same.
     """
@@ -456,7 +510,9 @@ def _last_use(path: Path) -> float:
 
 
 def _shrink(folder: Path) -> None:
-    """Remove programs, those not used for longest first, beyond `LARGEST`; one always stays."""
+    """Remove programs, those not used for longest first, beyond `LARGEST`; one always
+    stays.
+    """
     newest, *others = KeptPrograms(folder).files
     total = newest.stat().st_size
     for path in others:

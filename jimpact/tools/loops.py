@@ -1,8 +1,10 @@
-"""Loops that `shard_map` takes with its default check of which values vary among devices.
+"""Loops that `shard_map` takes with its default check of which values vary among
+devices.
 
-Inside `shard_map` the type of an array names the mesh axes that it varies over, and a loop must
-begin with the types that its passes end with. A state that starts from constants varies over no
-axis yet: the loops here make it vary over those that a pass adds. Elsewhere nothing changes.
+Inside `shard_map` the type of an array names the mesh axes that it varies over, and a
+loop must begin with the types that its passes end with. A state that starts from
+constants varies over no axis yet: the loops here make it vary over those that a pass
+adds. Elsewhere nothing changes.
 """
 
 from collections.abc import Callable
@@ -19,14 +21,17 @@ State = TypeVar("State")
 def over_lanes(count: jax.Array) -> jax.Array:
     """The sum of a whole number () over all lanes of `vmap`, that is its batch entries.
 
-    It is the same in all lanes: a condition or a loop on it is not turned into a selection.
+    It is the same in all lanes: a condition or a loop on it is not turned into a
+    selection.
     """
     return count
 
 
 @over_lanes.def_vmap
 def _over_lanes(size: int, batched: Any, count: jax.Array) -> tuple[jax.Array, bool]:
-    """Rule of `vmap` for `over_lanes`: the sum over its lanes (size,), the same in each."""
+    """Rule of `vmap` for `over_lanes`: the sum over its lanes (size,), the same in
+    each.
+    """
     return over_lanes(jnp.sum(count, axis=0, dtype=count.dtype)), False
 
 
@@ -36,7 +41,9 @@ def any_lane(happens: jax.Array) -> jax.Array:
 
 
 def while_loop(
-    goes_on: Callable[[State], jax.Array], one_pass: Callable[[State], State], start: State
+    goes_on: Callable[[State], jax.Array],
+    one_pass: Callable[[State], State],
+    start: State,
 ) -> State:
     """`jax.lax.while_loop` whose start varies over all mesh axes that a pass adds."""
     return jax.lax.while_loop(goes_on, one_pass, _begin(one_pass, start))
@@ -46,7 +53,9 @@ def fori_loop(
     first: int, last: Any, one_pass: Callable[[Any, State], State], start: State
 ) -> State:
     """`jax.lax.fori_loop` whose start varies over all mesh axes that a pass adds."""
-    return jax.lax.fori_loop(first, last, one_pass, _begin(lambda s: one_pass(first, s), start))
+    return jax.lax.fori_loop(
+        first, last, one_pass, _begin(lambda s: one_pass(first, s), start)
+    )
 
 
 def scan(
@@ -55,12 +64,16 @@ def scan(
     rows: Any,
     length: int | None = None,
 ) -> tuple[State, Any]:
-    """`jax.lax.scan` over `rows` whose start varies over all mesh axes that a pass adds."""
+    """`jax.lax.scan` over `rows` whose start varies over all mesh axes that a pass
+    adds.
+    """
     first = jax.tree.map(lambda x: x[0], rows)
     return jax.lax.scan(one, _begin(lambda s: one(s, first)[0], start), rows, length)
 
 
-def cond(which: jax.Array, then: Callable[[], State], otherwise: Callable[[], State]) -> State:
+def cond(
+    which: jax.Array, then: Callable[[], State], otherwise: Callable[[], State]
+) -> State:
     """`jax.lax.cond` of branches whose results may vary over different mesh axes."""
     if not jax.sharding.get_abstract_mesh().manual_axes:
         return jax.lax.cond(which, then, otherwise)
@@ -81,9 +94,11 @@ def cond(which: jax.Array, then: Callable[[], State], otherwise: Callable[[], St
 
 
 def _begin(one_pass: Callable[[Any], Any], start: Any) -> Any:
-    """The start of a loop, marked as varying over all mesh axes that its passes make it vary over.
+    """The start of a loop, marked as varying over all mesh axes that its passes make it
+    vary over.
 
-    Repeated until nothing changes: an array that varies may make others of the state vary.
+    Repeated until nothing changes: an array that varies may make others of the state
+    vary.
     """
     if not jax.sharding.get_abstract_mesh().manual_axes:
         return start
@@ -91,11 +106,15 @@ def _begin(one_pass: Callable[[Any], Any], start: Any) -> Any:
     kinds = jax.make_jaxpr(one_pass)(start).out_avals
     marked = [_varying(x, axes_of(kind)) for x, kind in zip(leaves, kinds)]
     same = all(a is b for a, b in zip(marked, leaves))
-    return start if same else _begin(one_pass, jax.tree.unflatten(tree, marked))
+    if same:
+        return start
+    return _begin(one_pass, jax.tree.unflatten(tree, marked))
 
 
 def varying_like(tree: Any, *like: Any) -> Any:
-    """The arrays of `tree`, varying over all mesh axes that an array of `like` varies over."""
+    """The arrays of `tree`, varying over all mesh axes that an array of `like` varies
+    over.
+    """
     kinds = [jax.typeof(x) for x in jax.tree.leaves(like) if eqx.is_array(x)]
     axes = frozenset().union(*map(axes_of, kinds))
     return jax.tree.map(lambda x: _varying(x, axes), tree)
@@ -104,7 +123,9 @@ def varying_like(tree: Any, *like: Any) -> Any:
 def _varying(x: Any, axes: frozenset[Any]) -> Any:
     """The array x, marked as varying over these mesh axes, too."""
     missing = axes and axes - axes_of(jax.typeof(x))
-    return jax.lax.pcast(x, tuple(missing), to="varying") if missing else x
+    if missing:
+        return jax.lax.pcast(x, tuple(missing), to="varying")
+    return x
 
 
 def axes_of(kind: Any) -> frozenset[Any]:
@@ -113,4 +134,6 @@ def axes_of(kind: Any) -> frozenset[Any]:
     Versions of JAX keep them under one of two names.
     """
     manual = getattr(kind, "manual_axis_type", None)
-    return getattr(kind, "vma", frozenset()) if manual is None else manual.varying
+    if manual is None:
+        return getattr(kind, "vma", frozenset())
+    return manual.varying

@@ -1,4 +1,6 @@
-"""Progress of long work on stderr: a bar on a terminal, elsewhere a line now and then."""
+"""Progress of long work on stderr: a bar on a terminal, elsewhere a line now and
+then.
+"""
 
 import contextlib
 import re
@@ -11,16 +13,20 @@ from collections.abc import Callable, Iterator
 
 from jimpact.tools.checks import check_values
 
-LONG = 2.0  # seconds after which work counts as long: sooner, messages would only flicker
+# seconds after which work counts as long: sooner, messages would only flicker
+LONG = 2.0
 LINE_EVERY = 10.0  # seconds between two lines about one step, a few for each minute
 
 FIRST = "compiling"  # the step until the work reports one
 
-Show = Callable[[str, float, float | None], None]  # show(step, done, total), total None: unknown
+# show(step, done, total), total None: unknown
+Show = Callable[[str, float, float | None], None]
 
 
 class Patience(float):
-    """Seconds after which work is reported; lines about it count time from when this was made."""
+    """Seconds after which work is reported; lines about it count time from when this
+    was made.
+    """
 
     def __init__(self, seconds: float) -> None:
         self.begun = time.monotonic()
@@ -30,15 +36,20 @@ class Patience(float):
 def progress_bar(progress: float | None) -> Iterator[Show]:
     """Yield `show(step, done, total)`; total None: not known.
 
-    `progress`: seconds after which the work is long enough to be reported; True: at once; False:
-    never; None: after two seconds, and only on a terminal.
+    `progress`: seconds after which the work is long enough to be reported; True: at
+    once; False: never; None: after two seconds, and only on a terminal.
     """
     terminal = sys.stderr.isatty()
     if progress is False or (progress is None and not terminal):
         yield lambda step, done, total: None
         return
     check_values("progress", progress, low=0.0)
-    after = LONG if progress is None else 0.0 if progress is True else progress
+    if progress is None:
+        after = LONG
+    elif progress is True:
+        after = 0.0
+    else:
+        after = progress
     with (_bar if terminal and _has_bars() else _lines)(after) as show:
         yield show
 
@@ -54,7 +65,9 @@ def _has_bars() -> bool:
 
 @contextlib.contextmanager
 def _bar(after: float) -> Iterator[Show]:
-    """Yield `show` of a bar of the package rich, which appears `after` this time [s]."""
+    """Yield `show` of a bar of the package rich, which appears `after` this time
+    [s].
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -64,7 +77,12 @@ def _bar(after: float) -> Iterator[Show]:
         TimeRemainingColumn as Remaining,
     )
 
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), Remaining()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        Remaining(),
+    )
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task(FIRST, total=None)
     timer = threading.Timer(after, bar.start)
@@ -81,11 +99,13 @@ def _bar(after: float) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _lines(after: float) -> Iterator[Show]:
-    """Yield `show` of lines on stderr with the latest step: the first one `after` this time [s].
+    """Yield `show` of lines on stderr with the latest step: the first one `after` this
+    time [s].
 
     Others follow each `LINE_EVERY`; where `after` is 0 one more is printed at the end.
     """
-    begun, ended = getattr(after, "begun", time.monotonic()), threading.Event()
+    begun = getattr(after, "begun", time.monotonic())
+    ended = threading.Event()
     latest = FIRST
 
     def report() -> None:
@@ -127,16 +147,21 @@ def waiting(step: str, progress: float | None = None) -> Iterator[None]:
 def counting_bar(
     total: int, unit: str, progress: float | None, done: int = 0
 ) -> Iterator[Callable[[int], None]]:
-    """Yield `advance(more)`, which counts `more` of a `unit` up to a `total` and shows the rate.
+    """Yield `advance(more)`, which counts `more` of a `unit` up to a `total` and shows
+    the rate.
 
-    `progress` as of `progress_bar`, `done` are finished before. The rate counts from the first
-    advance on, which waits for a program to be compiled.
+    `progress` as of `progress_bar`, `done` are finished before. The rate counts from
+    the first advance on, which waits for a program to be compiled.
     """
-    began, finished = None, done  # when the first advance came, and what was finished then
+    # when the first advance came, and what was finished then
+    began = None
+    finished = done
     with progress_bar(progress) as show:
 
         def advance(more: int) -> None:
-            """Add `more` to what is finished, and show it with the rate and the time left."""
+            """Add `more` to what is finished, and show it with the rate and the time
+            left.
+            """
             nonlocal began, finished
             finished += more
             now = time.perf_counter()
@@ -153,16 +178,21 @@ def counting_bar(
 
 
 class Steps:
-    """The steps that a command has done, each printed on stderr once the command is long."""
+    """The steps that a command has done, each printed on stderr once the command is
+    long.
+    """
 
     def __init__(self, command: str):
-        self.command, self.patience = command, Patience(LONG)
+        self.command = command
+        self.patience = Patience(LONG)
         self.done: list[str] = []
         # prints and writes what is finished; None: nothing is that could be shown
         self.show_finished: Callable[[], None] | None = None
 
     def __call__(self, step: str) -> None:
-        """Record a `step` that is done; print it where the command has run longer than `LONG`."""
+        """Record a `step` that is done; print it where the command has run longer than
+        `LONG`.
+        """
         self.done.append(step)
         seconds = time.monotonic() - self.patience.begun
         if seconds > LONG:
@@ -170,16 +200,21 @@ class Steps:
 
 
 def wrapped(text: str) -> str:
-    """The text with its sentences wrapped to the terminal's width; tables are left unchanged.
+    """The text with its sentences wrapped to the terminal's width; tables are left
+    unchanged.
 
-    A sentence behind a word or two and spaces, such as "status   ok", is wrapped within its column.
+    A sentence behind a word or two and spaces, such as "status   ok", is wrapped within
+    its column.
     """
     width = shutil.get_terminal_size((len(text), 0)).columns
     lines = []
     for line in text.splitlines():
         indent = re.match(r" *(- )?", line)[0]  # type: ignore[index]
         head = re.match(r"\S+(?: \S+)?  +", line)  # one or two words and spaces
-        start = indent if head is None else head[0]
+        if head is None:
+            start = indent
+        else:
+            start = head[0]
         if len(line) > width and "  " not in line[len(start) :]:  # no columns: no table
             line = textwrap.fill(line, width, subsequent_indent=" " * len(start))
         lines.append(line)

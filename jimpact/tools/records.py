@@ -18,12 +18,15 @@ from jimpact.tools.checks import needed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
-_ROUNDING = 1e-12  # share of a scale that is printed as 0; ten times more hides small velocities
-_LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones are not readable
+# share of a scale that is printed as 0; ten times more hides small velocities
+_ROUNDING = 1e-12
+# characters of a column whose text is wrapped; narrower ones are not readable
+_LEAST_WIDTH = 20
 
 
 def as_data(value: Any) -> Any:
-    """Records, arrays and mappings as dicts, lists and numbers of a JSON file; NaN, inf as None.
+    """Records, arrays and mappings as dicts, lists and numbers of a JSON file; NaN, inf
+    as None.
 
     >>> import numpy as np
     >>> from jimpact.tools.records import as_data
@@ -35,19 +38,26 @@ def as_data(value: Any) -> Any:
     if hasattr(value, "_asdict"):
         value = value._asdict()
     elif dataclasses.is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        value = {
+            field.name: getattr(value, field.name)
+            for field in dataclasses.fields(value)
+        }
     elif hasattr(value, "__array__"):
         value = np.asarray(value).tolist()
     if isinstance(value, Mapping):
         return {key: as_data(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [as_data(each) for each in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
 
 
 def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
     """The fields of a record but for those left out, see `as_data`."""
-    return {name: as_data(x) for name, x in vars(record).items() if name not in left_out}
+    return {
+        name: as_data(x) for name, x in vars(record).items() if name not in left_out
+    }
 
 
 def number(value: float | None, form: str) -> str:
@@ -57,7 +67,9 @@ def number(value: float | None, form: str) -> str:
     >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
     ('0.2', '', '')
     """
-    return "" if value is None or np.isnan(value) else format(value, form)
+    if value is None or np.isnan(value):
+        return ""
+    return format(value, form)
 
 
 def microseconds(time: float | None) -> str:
@@ -71,7 +83,8 @@ def microseconds(time: float | None) -> str:
 
 
 def listed(labels: Sequence[str], most: int = 6) -> str:
-    """The first labels of a list as text, "..." in the place of the others; at most `most`.
+    """The first labels of a list as text, "..." in the place of the others; at most
+    `most`.
 
     >>> from jimpact.tools.records import listed
     >>> listed(["1", "2"]), listed("abcd", 3)
@@ -81,7 +94,8 @@ def listed(labels: Sequence[str], most: int = 6) -> str:
 
 
 def readable_unit(unit: str, largest: float) -> tuple[str, float]:
-    """Multiple of an SI unit in which `largest` has 1 to 3 digits before the point, and its size.
+    """Multiple of an SI unit in which `largest` has 1 to 3 digits before the point, and
+    its size.
 
     >>> from jimpact.tools.records import readable_unit
     >>> readable_unit("m", 3e-5), readable_unit("s", 2.0)
@@ -114,7 +128,8 @@ def degrees(count: int) -> str:
 
 
 def formatted(value: Any, form: str) -> str:
-    """A number or text by Python's `format`; a number that rounds to 0 has no minus sign.
+    """A number or text by Python's `format`; a number that rounds to 0 has no minus
+    sign.
 
     >>> from jimpact.tools.records import formatted
     >>> formatted(-0.0, "6g"), formatted(-4e-9, ".5f"), formatted(-0.01, ".1e")
@@ -125,7 +140,11 @@ def formatted(value: Any, form: str) -> str:
     text = format(value, form)
     if isinstance(value, str):
         return text
-    if "-" in text and value <= 0 and not re.search("[1-9]|inf", text.partition("e")[0]):
+    if (
+        "-" in text
+        and value <= 0
+        and not re.search("[1-9]|inf", text.partition("e")[0])
+    ):
         text = text.replace("-", "", 1).rjust(len(text) if text[0] == " " else 0)
     return text
 
@@ -137,11 +156,14 @@ def plain(value: float, scale: float = 1.0) -> float:
     >>> plain(-0.0), plain(-1e-17), plain(-0.5)
     (0.0, 0.0, -0.5)
     """
-    return 0.0 if abs(value) <= _ROUNDING * abs(scale) else value
+    if abs(value) <= _ROUNDING * abs(scale):
+        return 0.0
+    return value
 
 
 def with_error(value: float, error: float) -> str:
-    """A value and its standard error as text, to the error's first digit (two if this is 1).
+    """A value and its standard error as text, to the error's first digit (two if this
+    is 1).
 
     >>> from jimpact.tools.records import with_error
     >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
@@ -150,17 +172,23 @@ def with_error(value: float, error: float) -> str:
     if not 1e-9 * abs(value) < error < np.inf:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
-    digits = max(0, -power + (error < 2 * 10.0**power))  # two digits of an error that begins with 1
+    # two digits of an error that begins with 1
+    digits = max(0, -power + (error < 2 * 10.0**power))
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def table(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = (), keys: int = 1
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    left: Sequence[str] = (),
+    keys: int = 1,
 ) -> list[str]:
-    """Lines of a table; the first column and those with a head in `left` are text, others numbers.
+    """Lines of a table; the first column and those with a head in `left` are text,
+    others numbers.
 
-    On a terminal that is too narrow the columns are split into several tables, one below the other,
-    each with the first `keys` columns; text at the end of a line is wrapped.
+    On a terminal that is too narrow the columns are split into several tables, one
+    below the other, each with the first `keys` columns; text at the end of a line is
+    wrapped.
 
     >>> from jimpact.tools.records import table
     >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
@@ -169,25 +197,33 @@ def table(
     all_rows = [list(heads), *map(list, rows)]
     widths = [max(map(len, column)) for column in zip(*all_rows)]
     is_text = [i == 0 or head in left for i, head in enumerate(heads)]
-    room = shutil.get_terminal_size((sum(widths) + 2 * len(widths), 0)).columns  # no terminal: all
+    # no terminal: all
+    room = shutil.get_terminal_size((sum(widths) + 2 * len(widths), 0)).columns
     lines: list[str] = []
     for part in _parts(widths, keys, room):
-        lines += [""] if lines else []
-        before = sum(widths[i] + 2 for i in part[:-1])  # characters before the last column
+        if lines:
+            lines += [""]
+        else:
+            lines += []
+        # characters before the last column
+        before = sum(widths[i] + 2 for i in part[:-1])
         for row in all_rows:
             cells = (
-                row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i]) for i in part
+                row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i])
+                for i in part
             )
             line = "  ".join(cells).rstrip()
             wrapped = is_text[part[-1]] and len(line) > room > before + _LEAST_WIDTH
-            lines += (
-                textwrap.wrap(line, room, subsequent_indent=" " * before) if wrapped else [line]
-            )
+            if wrapped:
+                lines += textwrap.wrap(line, room, subsequent_indent=" " * before)
+            else:
+                lines += [line]
     return lines
 
 
 class Column(NamedTuple):
-    """A column: its name in data and CSV, head and unit in print, and the form of its numbers.
+    """A column: its name in data and CSV, head and unit in print, and the form of its
+    numbers.
 
     `form`: as of `format`, or a function of the value. Text stands on the left.
     """
@@ -203,10 +239,14 @@ class Column(NamedTuple):
         return (self.head or self.name) + (f" [{self.unit}]" if self.unit else "")
 
     def cell(self, value: Any) -> str:
-        """A value as it is printed; '' for None and NaN, unless `form` is a function."""
+        """A value as it is printed; '' for None and NaN, unless `form` is a
+        function.
+        """
         if callable(self.form):
             return self.form(value)
-        return "" if value is None or value != value else formatted(value, self.form)
+        if value is None or value != value:
+            return ""
+        return formatted(value, self.form)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +258,8 @@ class Table:
         rows: a value for each column; None or NaN: an empty cell.
         head: lines above.
         notes: lines below.
-        keys: how many columns are repeated where a terminal is too narrow for one table.
+        keys: how many columns are repeated where a terminal is too narrow for one
+            table.
 
     >>> from jimpact.tools.records import Column, Table
     >>> columns = Column("law"), Column("e", ".2f"), Column("time_s", "g", "time", "s")
@@ -237,20 +278,28 @@ class Table:
     def __str__(self) -> str:
         """The table with its head and notes."""
         cells = [[c.cell(x) for c, x in zip(self.columns, row)] for row in self.rows]
-        used = [i for i in range(len(self.columns)) if any(row[i] for row in cells)]  # not empty
+        # not empty
+        used = [i for i in range(len(self.columns)) if any(row[i] for row in cells)]
         text = [any(isinstance(x, str) for x in column) for column in zip(*self.rows)]
         left = [c.title for c, is_text in zip(self.columns, text) if is_text]
         titles = [self.columns[i].title for i in used]
         rows = [[row[i] for i in used] for row in cells]
-        lines = table(titles, rows, left, self.keys) if rows else []
+        if rows:
+            lines = table(titles, rows, left, self.keys)
+        else:
+            lines = []
         return "\n".join([*self.head, *lines, *self.notes])
 
     def to_dict(self) -> list[dict[str, Any]]:
         """A mapping by column for each row, as a JSON file can hold it."""
-        return [as_data({c.name: x for c, x in zip(self.columns, row)}) for row in self.rows]
+        return [
+            as_data({c.name: x for c, x in zip(self.columns, row)}) for row in self.rows
+        ]
 
     def to_csv(self, path: str | Path | None = None) -> str:
-        """Lines of a CSV file, also written to the path; what is None or NaN is an empty cell."""
+        """Lines of a CSV file, also written to the path; what is None or NaN is an
+        empty cell.
+        """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([c.name for c in self.columns])
@@ -288,15 +337,19 @@ class Tabular:
         return self.table.to_pandas()
 
     def plot(self, title: str = "") -> "Figure":
-        """The figure that `ji.plot` draws of the result; raise a TypeError if there is none."""
+        """The figure that `ji.plot` draws of the result; raise a TypeError if there is
+        none.
+        """
         if not self.picture:
             raise TypeError(f"{type(self).__name__} has no picture, only a `table`.")
-        pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
+        # late: matplotlib takes long to import
+        pictures = import_module("jimpact.plot")
         return getattr(pictures, self.picture)(self, title=title)
 
 
 def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
-    """Numbers of the columns of tables that fit the `room` [characters], the first `keys` in each.
+    """Numbers of the columns of tables that fit the `room` [characters], the first
+    `keys` in each.
 
     `widths` are those of the columns; two spaces stand between them.
 

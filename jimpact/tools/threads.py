@@ -1,4 +1,6 @@
-"""Work in threads, one for each core that the process may use: programs of XLA run side by side."""
+"""Work in threads, one for each core that the process may use: programs of XLA run side
+by side.
+"""
 
 import os
 from collections import deque
@@ -18,8 +20,8 @@ from jimpact.tools.checks import as_whole
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Tasks that wait for each thread beside the one that it works on. Ten times more: their results
-# fill the memory; none: threads wait for the caller.
+# Tasks that wait for each thread beside the one that it works on. Ten times more: their
+# results fill the memory; none: threads wait for the caller.
 _AHEAD = 1
 
 
@@ -32,7 +34,9 @@ def usable_cores() -> int:
 
 def as_workers(workers: Any) -> int:
     """A number of threads, None: one for each core that the process may use."""
-    return usable_cores() if workers is None else as_whole("workers", workers, 1)
+    if workers is None:
+        return usable_cores()
+    return as_whole("workers", workers, 1)
 
 
 def in_threads(
@@ -43,16 +47,16 @@ def in_threads(
 ) -> Generator[Result]:
     """`function(task)` of each task, in their order, whatever the number of threads.
 
-    JAX releases Python's lock while a program runs, and most programs of impacts use one core. An
-    error of a task is raised where its result would come; tasks that have not begun are then
-    dropped.
+    JAX releases Python's lock while a program runs, and most programs of impacts use
+    one core. An error of a task is raised where its result would come; tasks that have
+    not begun are then dropped.
 
     Args:
         function: of one task; it sees the caller's settings of JAX.
         tasks: any iterable; some `workers` of them are taken ahead.
         workers: threads >= 1; None: one for each core that the process may use.
-        compiles: whether the first task compiles what the others run: they wait for it, lest each
-            thread compiles the same program.
+        compiles: whether the first task compiles what the others run: they wait for it,
+            lest each thread compiles the same program.
 
     Yields:
         The results.
@@ -64,7 +68,8 @@ def in_threads(
     >>> list(in_threads(lambda x: x**2, range(4), workers=2))
     [0, 1, 4, 9]
     """
-    count, tasks = as_workers(workers), iter(tasks)
+    count = as_workers(workers)
+    tasks = iter(tasks)
     if compiles or count == 1:
         yield from map(function, islice(tasks, None if count == 1 else 1))
     first = list(islice(tasks, 2))
@@ -74,7 +79,9 @@ def in_threads(
     as_here = _settings()
 
     def one(task: Task) -> Result:
-        """Result of a task with the caller's settings of JAX, which belong to a thread."""
+        """Result of a task with the caller's settings of JAX, which belong to a
+        thread.
+        """
         with as_here():
             return function(task)
 
@@ -100,7 +107,8 @@ def in_parts(
     workers: int | None = None,
     compiles: bool = True,
 ) -> Iterator[tuple[np.ndarray, Any]]:
-    """`function` applied to rows of arrays, `size` rows at a time: one program for all parts.
+    """`function` applied to rows of arrays, `size` rows at a time: one program for all
+    parts.
 
     Args:
         function: of trees like these, with `size` rows each.
@@ -115,14 +123,19 @@ def in_parts(
 
     >>> import numpy as np
     >>> from jimpact.tools.threads import in_parts
-    >>> [(rows.tolist(), y.tolist()) for rows, y in in_parts(lambda x: 2 * x, [np.arange(3)], 2)]
+    >>> [
+    ...     (rows.tolist(), y.tolist())
+    ...     for rows, y in in_parts(lambda x: 2 * x, [np.arange(3)], 2)
+    ... ]
     [([0, 1], [0, 2]), ([2, 2], [4, 4])]
     """
     if which is None:
         which = np.arange(len(jax.tree.leaves(trees)[0]))
 
     def rows(first: int) -> np.ndarray:
-        """Numbers (size,) of the rows of the part from `which[first]` on, the last one repeated."""
+        """Numbers (size,) of the rows of the part from `which[first]` on, the last one
+        repeated.
+        """
         return which[np.minimum(np.arange(first, first + size), len(which) - 1)]
 
     def result(first: int) -> Any:

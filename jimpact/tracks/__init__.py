@@ -1,4 +1,4 @@
-"""From the camera to a fit: velocities before and after impacts from tracks and bounce times.
+"""From the camera to a fit: velocities at impacts from tracks and bounce times.
 
 >>> import jimpact as ji
 >>> shots = ji.tracks.bounce_times([0.0, 0.5, 0.9, 1.22], sigma=0.001)

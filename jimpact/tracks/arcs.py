@@ -1,15 +1,16 @@
 """Ballistic arcs through common points: flights and instants of all impacts at once.
 
 Between the instants tau_i and tau_(i+1) of two impacts the places are
-`P_i (1 - s) + P_(i+1) s - a (t - tau_i) (tau_(i+1) - t) / 2`, s = (t - tau_i) / h, h the duration:
-v+ = (P_(i+1) - P_i) / h - a h / 2 after the first, v- = (P_(i+1) - P_i) / h + a h / 2 before the
-second. Places and instants are found by Gauss-Newton; an arc meets its neighbours only, so that the
-normal matrix is banded.
+`P_i (1 - s) + P_(i+1) s - a (t - tau_i) (tau_(i+1) - t) / 2`, s = (t - tau_i) / h, h
+the duration: v+ = (P_(i+1) - P_i) / h - a h / 2 after the first, v- = (P_(i+1) - P_i) /
+h + a h / 2 before the second. Places and instants are found by Gauss-Newton; an arc
+meets its neighbours only, so that the normal matrix is banded.
 
-K impacts have K + 2 ends of K + 1 flights: the impacts, the first and the last frame. The unknowns
-of the fit are (P_i, tau_i, b_i) of each end in turn, 2 n + 1 values, b_i the acceleration of the
-flight's own that begins there (0 unless the model has it), then those of acceleration (n) and drag
-(1) that are unknown. Slopes of one flight are in W values: those of both its ends, a, k.
+K impacts have K + 2 ends of K + 1 flights: the impacts, the first and the last frame.
+The unknowns of the fit are (P_i, tau_i, b_i) of each end in turn, 2 n + 1 values, b_i
+the acceleration of the flight's own that begins there (0 unless the model has it), then
+those of acceleration (n) and drag (1) that are unknown. Slopes of one flight are in W
+values: those of both its ends, a, k.
 """
 
 from dataclasses import dataclass, replace
@@ -25,15 +26,18 @@ from jimpact.tracks.flight import Flight
 from jimpact.tracks.frames import Frames
 from jimpact.tracks.waves import Errors
 
-STEPS = 60  # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
+# of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
+STEPS = 60
 SETTLING = 20  # steps after which frames stay in their flights
-# Frames that an instant may lie within the flights that were found, as a frame near an impact may
-# lie on either arc. Ten times more, and the instant of a jump that is none would run away.
+# Frames that an instant may lie within the flights that were found, as a frame near an
+# impact may lie on either arc. Ten times more, and the instant of a jump that is none
+# would run away.
 BEYOND = 3
-# Share of a flight by which an instant moves in a step, below one half, so that two never meet.
+# Share of a flight by which an instant moves in a step, below one half, so that two
+# never meet.
 LARGEST_MOVE = 0.45
-# Share of a frame below which the instants have settled, and the places in their parts. Ten times
-# more is still far below noise.
+# Share of a frame below which the instants have settled, and the places in their parts.
+# Ten times more is still far below noise.
 SETTLED = 1e-7
 
 
@@ -41,10 +45,11 @@ SETTLED = 1e-7
 class Arcs:
     """Arcs between K + 2 ends, of which the first and the last are no impacts.
 
-    Fields: instants tau (K + 2,) [s], places P (K + 2, n) [m, rad], accelerations of flights' own
-    (K + 2, n), the model of the flights, their errors; covariance of the unknowns; members: frames
-    of each flight; residual (T, n) in units of sigma, NaN where no frame was used; `bent` (K + 1,
-    n), true where a flight has an acceleration of its own.
+    Fields: instants tau (K + 2,) [s], places P (K + 2, n) [m, rad], accelerations of
+    flights' own (K + 2, n), the model of the flights, their errors; covariance of the
+    unknowns; members: frames of each flight; residual (T, n) in units of sigma, NaN
+    where no frame was used; `bent` (K + 1, n), true where a flight has an acceleration
+    of its own.
     """
 
     instants: np.ndarray
@@ -74,7 +79,9 @@ class Arcs:
 
     @cached_property
     def end_velocities(self) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities (K + 1, n) at the first and at the last end of each flight [m/s, rad/s]."""
+        """Velocities (K + 1, n) at the first and at the last end of each flight [m/s,
+        rad/s].
+        """
         h = np.diff(self.instants)
         mean = np.diff(self.places, axis=0) / h[:, None]
         bend = (self.acceleration + self.own[:-1]) / 2 * h[:, None]
@@ -89,7 +96,9 @@ class Arcs:
 
     @property
     def size(self) -> int:
-        """Number of values of an end in `covariance`: place, instant, acceleration of its own."""
+        """Number of values of an end in `covariance`: place, instant, acceleration of
+        its own.
+        """
         return 2 * self.places.shape[1] + 1
 
     def rows_of_instants(self) -> np.ndarray:
@@ -109,12 +118,15 @@ class Arcs:
         )
 
     def ends(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Instants (2,) and places (2, n) of the ends of flight i, its own acceleration (n,)."""
+        """Instants (2,) and places (2, n) of the ends of flight i, its own acceleration
+        (n,).
+        """
         pair = slice(i, i + 2)
         return self.instants[pair], self.places[pair], self.own[i]
 
     def velocities(self) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities v- (K, n) and v+ (K, n) [m/s, rad/s] of each impact, see the head of the file.
+        """Velocities v- (K, n) and v+ (K, n) [m/s, rad/s] of each impact, see the head
+        of the file.
 
         Drag adds the end rates of `bent` to those of parabolas.
         """
@@ -124,14 +136,15 @@ class Arcs:
     def gain(self) -> np.ndarray:
         """Derivatives (K, 2, n, N) of v- and v+ in the N unknowns of `covariance`.
 
-        Of a flight with duration h and mean velocity w: `v = w -/+ a h / 2` at its first and last
-        end, w = (P_1 - P_0) / h, dw/dtau_1 = -w / h.
+        Of a flight with duration h and mean velocity w: `v = w -/+ a h / 2` at its
+        first and last end, w = (P_1 - P_0) / h, dw/dtau_1 = -w / h.
         """
         K = self.impacts
         n = self.places.shape[1]
         size = self.size
         gain = np.zeros((K, 2, n, len(self.covariance)))
-        for i in range(K + 1):  # flight i has v+ of the impact before it, v- of the one after it
+        # flight i has v+ of the impact before it, v- of the one after it
+        for i in range(K + 1):
             slopes = self._end_slopes(i)
             own = slice(i * size, (i + 2) * size)
             common = slopes[:, :, 2 * size + self.flight.columns]
@@ -151,7 +164,8 @@ class Arcs:
         mean = (places[-1] - places[0]) / h
         slopes = np.zeros((2, n, 2 * size + n + 1))
         for end, sign in ((0, -1.0), (1, 1.0)):
-            slope = mean / h - sign * (self.acceleration + own) / 2  # of the velocity in -h
+            # of the velocity in -h
+            slope = mean / h - sign * (self.acceleration + own) / 2
             slopes[end, each, each] = -1 / h
             slopes[end, each, size + each] = 1 / h
             slopes[end, :, n] = slope
@@ -166,7 +180,9 @@ class Arcs:
     @property
     def drag_error(self) -> float:
         """Standard error of an unknown drag, 0 of a known one [1/m]."""
-        return float(np.sqrt(self.covariance[-1, -1])) if self.flight.drag_unknown else 0.0
+        if self.flight.drag_unknown:
+            return float(np.sqrt(self.covariance[-1, -1]))
+        return 0.0
 
     def instant_errors(self) -> np.ndarray:
         """Standard errors (K,) of the instants [s]."""
@@ -174,7 +190,9 @@ class Arcs:
 
     @cached_property
     def covariance_of_velocities(self) -> np.ndarray:
-        """Covariance `G C G^T` (2nK, 2nK) of (v-, v+) of each impact in turn, G of `gain`."""
+        """Covariance `G C G^T` (2nK, 2nK) of (v-, v+) of each impact in turn, G of
+        `gain`.
+        """
         flat = self.gain().reshape(-1, len(self.covariance))
         return flat @ self.covariance @ flat.T
 
@@ -198,7 +216,9 @@ class Arcs:
 
 
 def _in_columns(slopes: np.ndarray, n: int) -> np.ndarray:
-    """Slopes (.., 3 n + 3) of `bent_slopes` in the W columns of the unknowns of a flight."""
+    """Slopes (.., 3 n + 3) of `bent_slopes` in the W columns of the unknowns of a
+    flight.
+    """
     size = 2 * n + 1
     ends = np.arange(n + 1)
     found = np.zeros((*slopes.shape[:-1], 2 * size + n + 1))
@@ -209,12 +229,16 @@ def _in_columns(slopes: np.ndarray, n: int) -> np.ndarray:
 
 
 def _rows_of_instants(ends: int, n: int) -> np.ndarray:
-    """Rows (ends - 2,) of the instants of impacts among (place, instant, own acceleration)."""
+    """Rows (ends - 2,) of the instants of impacts among (place, instant, own
+    acceleration).
+    """
     return (np.arange(ends - 2) + 1) * (2 * n + 1) + n
 
 
 class _Ends(NamedTuple):
-    """Instants, places and accelerations of flights' own (K + 2, ..), and the model: all values."""
+    """Instants, places and accelerations of flights' own (K + 2, ..), and the model:
+    all values.
+    """
 
     tau: np.ndarray
     places: np.ndarray
@@ -226,10 +250,11 @@ class _Ends(NamedTuple):
 class Start:
     """What a fit starts from.
 
-    Fields: frames of each flight; the model with first values; errors; `bent` (K + 1, n), true
-    where a flight has an acceleration of its own beside that of the model; the duration of a
-    contact, whose frames are left out [s]; first values of the instants (K,), None: where arcs
-    cross; instant_errors (K,): the instants are known, with these standard errors, and stay.
+    Fields: frames of each flight; the model with first values; errors; `bent` (K + 1,
+    n), true where a flight has an acceleration of its own beside that of the model; the
+    duration of a contact, whose frames are left out [s]; first values of the instants
+    (K,), None: where arcs cross; instant_errors (K,): the instants are known, with
+    these standard errors, and stay.
     """
 
     flights: list[np.ndarray]
@@ -243,18 +268,23 @@ class Start:
     def joined_at(self, k: int) -> "Start":
         """The same with flights k and k + 1 as one."""
         two = slice(k, k + 2)
-        flights = [*self.flights[:k], np.concatenate(self.flights[two]), *self.flights[k + 2 :]]
+        flights = [
+            *self.flights[:k],
+            np.concatenate(self.flights[two]),
+            *self.flights[k + 2 :],
+        ]
         bent = np.delete(self.bent, k, axis=0)
         bent[k] |= self.bent[k]
         return replace(self, flights=flights, bent=bent)
 
 
 def fit_arcs(frames: Frames, start: Start) -> Arcs:
-    """The arcs of these flights by maximum likelihood: least squares of (q - arc), by their errors.
+    """The arcs of these flights by maximum likelihood: least squares of (q - arc), by
+    their errors.
 
-    Gauss-Newton steps in places, instants and what is unknown, each instant bounded by the last
-    frame seen before and the first one seen after it; after every step frames are divided among the
-    flights anew.
+    Gauss-Newton steps in places, instants and what is unknown, each instant bounded by
+    the last frame seen before and the first one seen after it; after every step frames
+    are divided among the flights anew.
     """
     t = frames.t
     flights = [some[np.isfinite(frames.q[some]).any(axis=1)] for some in start.flights]
@@ -297,10 +327,11 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
 
 
 def crossings(frames: Frames, flights: list[np.ndarray], flight: Flight) -> np.ndarray:
-    """Instants (K,) at which the lines of neighbouring flights cross, acceleration taken away.
+    """Instants (K,) at which the lines of neighbouring flights cross, acceleration
+    taken away.
 
-    Equation: lines `p + v (t - t_0)` of both: the least `|dp + dv (t - t_0)|` in sigma, between the
-    last frame before and the first one after.
+    Equation: lines `p + v (t - t_0)` of both: the least `|dp + dv (t - t_0)|` in sigma,
+    between the last frame before and the first one after.
     """
     instants = np.zeros(len(flights) - 1)
     straight = flight.straight(frames)
@@ -316,15 +347,23 @@ def crossings(frames: Frames, flights: list[np.ndarray], flight: Flight) -> np.n
         dp = (p_here - p) / frames.sigma
         dv = (v_here - v) / frames.sigma
         size = float(dv @ dv)
-        since = -float(dp @ dv) / size if size > 0 else np.inf
-        instants[k] = at + since if low <= at + since <= high else (low + high) / 2
+        if size > 0:
+            since = -float(dp @ dv) / size
+        else:
+            since = np.inf
+        if low <= at + since <= high:
+            instants[k] = at + since
+        else:
+            instants[k] = (low + high) / 2
     return instants
 
 
 def _line(
     frames: Frames, some: np.ndarray, acceleration: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Middle of a flight [s], place (n,) and velocity (n,) there, by lines of least squares."""
+    """Middle of a flight [s], place (n,) and velocity (n,) there, by lines of least
+    squares.
+    """
     at = float(frames.t[some].mean())
     n = frames.q.shape[1]
     place = np.zeros(n)
@@ -337,7 +376,10 @@ def _line(
         y = frames.q[ok, c] - acceleration[c] * x**2 / 2
         spread = x - x.mean()
         size = float(spread @ spread)
-        velocity[c] = float(spread @ y) / size if size > 0 else 0.0
+        if size > 0:
+            velocity[c] = float(spread @ y) / size
+        else:
+            velocity[c] = 0.0
         place[c] = y.mean() - velocity[c] * x.mean()
     return at, place, velocity
 
@@ -352,10 +394,11 @@ class _Members:
     flights: list[np.ndarray]
 
     def at(self, tau: np.ndarray) -> list[np.ndarray]:
-        """Frames of each flight by the instants tau; those in contact, tau_i +/- contact / 2, are
-        out.
+        """Frames of each flight by the instants tau; those in contact, tau_i +/-
+        contact / 2, are out.
 
-        If a flight had less than 3 frames so, all of them stay as they are in `flights`.
+        If a flight had less than 3 frames so, all of them stay as they are in
+        `flights`.
         """
         x = self.t[self.pool]
         low = np.searchsorted(x, tau[1:-1] + self.contact / 2)
@@ -368,16 +411,21 @@ class _Members:
 
 
 class NormalMatrix(NamedTuple):
-    """Normal matrix J^T C^-1 J: banded for the ends (N values), bordered by b common ones."""
+    """Normal matrix J^T C^-1 J: banded for the ends (N values), bordered by b common
+    ones.
+    """
 
-    bands: np.ndarray  # (width + 1, N) upper bands, as `scipy.linalg.solveh_banded` takes them
+    # (width + 1, N) upper bands, as `scipy.linalg.solveh_banded` takes them
+    bands: np.ndarray
     border: np.ndarray  # (N, b)
     corner: np.ndarray  # (b, b)
     fixed: np.ndarray  # values that stay
 
 
 class _Change(NamedTuple):
-    """Step in instants (K + 2,), places, own accelerations (K + 2, n), and the model (b,)."""
+    """Step in instants (K + 2,), places, own accelerations (K + 2, n), and the model
+    (b,).
+    """
 
     tau: np.ndarray
     places: np.ndarray
@@ -385,7 +433,9 @@ class _Change(NamedTuple):
     common: np.ndarray
 
     def seconds(self, moved: np.ndarray, ends: _Ends) -> float:
-        """Size of the step [s]: of instants, `moved`, and of places where the model bends."""
+        """Size of the step [s]: of instants, `moved`, and of places where the model
+        bends.
+        """
         size = float(np.abs(moved).max(initial=0.0))
         if not ends.flight.bends:
             return size
@@ -398,7 +448,11 @@ class _Problem:
     """Least squares of one division of the frames: residuals, slopes and steps."""
 
     def __init__(
-        self, frames: Frames, errors: Errors, bent: np.ndarray, members: list[np.ndarray]
+        self,
+        frames: Frames,
+        errors: Errors,
+        bent: np.ndarray,
+        members: list[np.ndarray],
     ) -> None:
         self.frames = frames
         self.errors = errors
@@ -417,7 +471,9 @@ class _Problem:
         return _Problem(self.frames, self.errors, self.bent, members)
 
     def _covariance(self, c: int, ok: np.ndarray) -> tuple:
-        """Covariance of coordinate c in the frames `ok`, and the flights that have any."""
+        """Covariance of coordinate c in the frames `ok`, and the flights that have
+        any.
+        """
         own = self.flights[ok]
         starts = np.flatnonzero(np.diff(own, prepend=-1))
         return self.errors.of(c, self.frames.t[self.rows[ok]], starts), own[starts]
@@ -425,7 +481,8 @@ class _Problem:
     def arc(self, ends: _Ends) -> np.ndarray:
         """Places (R, n) of all frames in flights.
 
-        Equation: `P_i (1 - s) + P_(i+1) s - a (x - tau_i) (tau_(i+1) - x) / 2`, and D of `bent`.
+        Equation: `P_i (1 - s) + P_(i+1) s - a (x - tau_i) (tau_(i+1) - x) /
+        2`, and D of `bent`.
         """
         x = self.frames.t[self.rows]
         since = x - ends.tau[self.flights]
@@ -445,7 +502,9 @@ class _Problem:
     def residual(self, ends: _Ends) -> np.ndarray:
         """Residuals (T, n) in sigma, NaN where a frame is in no flight."""
         found = np.full(self.frames.q.shape, np.nan)
-        found[self.rows] = (self.frames.q[self.rows] - self.arc(ends)) / self.errors.sigma
+        found[self.rows] = (
+            self.frames.q[self.rows] - self.arc(ends)
+        ) / self.errors.sigma
         return found
 
     def slopes(self, ends: _Ends) -> np.ndarray:
@@ -484,10 +543,12 @@ class _Problem:
         return slopes
 
     def drift(self, ends: _Ends) -> np.ndarray:
-        """Velocities u (K + 2, n) of the ends: means of those of the flights on both sides.
+        """Velocities u (K + 2, n) of the ends: means of those of the flights on both
+        sides.
 
-        A step moves an instant and its place by `u dtau` together: else a coordinate without a jump
-        that is seen exactly would hide what the others say of the instant.
+        A step moves an instant and its place by `u dtau` together: else a coordinate
+        without a jump that is seen exactly would hide what the others say of the
+        instant.
         """
         rise = np.diff(ends.places, axis=0) / np.diff(ends.tau)[:, None]
         whole = np.concatenate([rise[:1], rise, rise[-1:]])
@@ -502,9 +563,9 @@ class _Problem:
     def step(self, ends: _Ends, moving: bool) -> tuple[NormalMatrix, _Change]:
         """Normal matrix at these values, and the Gauss-Newton step from them.
 
-        Equation: `J^T C^-1 J step = J^T C^-1 r`, r = q - arc over frames that were seen, J the
-        derivatives of the arcs, C the covariance of the errors. Instants stay unless `moving`,
-        those of the first and the last end always.
+        Equation: `J^T C^-1 J step = J^T C^-1 r`, r = q - arc over frames that were
+        seen, J the derivatives of the arcs, C the covariance of the errors. Instants
+        stay unless `moving`, those of the first and the last end always.
         """
         n = ends.places.shape[1]
         size = 2 * n + 1
@@ -516,7 +577,8 @@ class _Problem:
         grams = np.zeros((len(self.members), width, width))
         for c, ok in enumerate(self.seen):
             covariance, flights = self.covariances[c]
-            # of P only coordinate c of both ends moves this one, unless drag couples them
+            # of P only coordinate c of both ends moves this one, unless drag couples
+            # them
             own = np.arange(width - 1)
             if not ends.flight.bends:
                 common = np.flatnonzero(used == 2 * size + c)
@@ -529,8 +591,12 @@ class _Problem:
             grams[at] += np.add.reduceat(products, covariance.starts, axis=0)
         return self._solved(grams, ends, moving)
 
-    def _solved(self, grams: np.ndarray, ends: _Ends, moving: bool) -> tuple[NormalMatrix, _Change]:
-        """Normal matrix and step from products (F, W, W) of slopes and residual in flights."""
+    def _solved(
+        self, grams: np.ndarray, ends: _Ends, moving: bool
+    ) -> tuple[NormalMatrix, _Change]:
+        """Normal matrix and step from products (F, W, W) of slopes and residual in
+        flights.
+        """
         count, n = ends.places.shape
         size = 2 * n + 1
         pair = 2 * size
@@ -544,7 +610,10 @@ class _Problem:
         corner = grams[:, pair:-1, pair:-1].sum(axis=0)
         right_b = grams[:, pair:-1, -1].sum(axis=0)
         instants = np.arange(count) * size + n
-        still = instants[[0, -1]] if moving else instants
+        if moving:
+            still = instants[[0, -1]]
+        else:
+            still = instants
         straight = np.ones((count, n), bool)
         straight[:-1] = ~self.bent
         end, coordinate = np.nonzero(straight)
@@ -578,8 +647,8 @@ def _of_places(covariance: np.ndarray, drift: np.ndarray) -> np.ndarray:
 def _banded(blocks: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.ndarray:
     """Upper bands (2 size, ends size) of the sum of the blocks of neighbouring ends.
 
-    Row `width - d` holds the d-th diagonal above the main one. Unknowns `fixed` keep 1 on the
-    diagonal, and 0 elsewhere.
+    Row `width - d` holds the d-th diagonal above the main one. Unknowns `fixed` keep 1
+    on the diagonal, and 0 elsewhere.
     """
     width = 2 * size - 1
     count = ends * size
@@ -602,13 +671,15 @@ def _solve(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solution (x (N,), y (b,)) of the bordered system, by elimination of x.
 
-    Equation: `A x + B y = right`, `B^T x + C y = right_b`: `(C - B^T A^-1 B) y = right_b - B^T A^-1
-    right`. A has the bands, B is the border, C the corner.
+    Equation: `A x + B y = right`, `B^T x + C y = right_b`: `(C - B^T A^-1 B) y =
+    right_b - B^T A^-1 right`. A has the bands, B is the border, C the corner.
     """
     bands, border, corner, _ = normal
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     both = np.column_stack([right, border])
-    solved = scale[:, None] * solveh_banded(_scaled(bands, scale), scale[:, None] * both)
+    solved = scale[:, None] * solveh_banded(
+        _scaled(bands, scale), scale[:, None] * both
+    )
     alone = solved[:, 0]
     by_border = solved[:, 1:]
     schur = np.linalg.pinv(corner - border.T @ by_border, hermitian=True)
@@ -627,7 +698,8 @@ def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _inverse(normal: NormalMatrix) -> np.ndarray:
-    """Covariance: inverse of the normal matrix by blocks; values that stay have variance 0.
+    """Covariance: inverse of the normal matrix by blocks; values that stay have
+    variance 0.
 
     Equation: with `R = (C - B^T A^-1 B)^-1` it is
     `[[A^-1 + A^-1 B R B^T A^-1, -A^-1 B R], [-R B^T A^-1, R]]`.

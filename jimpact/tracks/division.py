@@ -1,8 +1,10 @@
-"""Flights of a track: the cheapest division of its frames into ballistic flights and lost ones.
+"""Flights of a track: the cheapest division of its frames into ballistic flights and
+lost ones.
 
-A flight is a straight line in each coordinate once its acceleration is taken away. Its cost is
-chi^2 and a price for beginning one; dynamic programming finds the division of least cost (Jackson
-et al., IEEE Signal Processing Letters 12, 2005). The time grows as T log T, T the frames.
+A flight is a straight line in each coordinate once its acceleration is taken away. Its
+cost is chi^2 and a price for beginning one; dynamic programming finds the division of
+least cost (Jackson et al., IEEE Signal Processing Letters 12, 2005). The time grows as
+T log T, T the frames.
 """
 
 from dataclasses import dataclass
@@ -12,24 +14,27 @@ from scipy.stats import chi2
 
 from jimpact.tracks.frames import Frames
 
-# A frame that fits no flight costs what one good frame in so many exceeds. Ten times more would
-# keep more false points in flights, ten times less would lose more good frames.
+# A frame that fits no flight costs what one good frame in so many exceeds. Ten times
+# more would keep more false points in flights, ten times less would lose more good
+# frames.
 LOST_SHARE = 1e-3
-# Jump of a velocity, in standard errors, from which on it is an impact. Ten times more would miss
-# soft impacts; of noise alone five or more is found once in a million.
+# Jump of a velocity, in standard errors, from which on it is an impact. Ten times more
+# would miss soft impacts; of noise alone five or more is found once in a million.
 SMALLEST_JUMP = 5.0
 # Frames whose costs are computed at once. Ten times more would take as long.
 BLOCK = 32
-# Frames after which not every frame is kept as a possible beginning of a flight, but every other,
-# after twice as many every fourth. Ten times less would blur instants of soft impacts.
+# Frames after which not every frame is kept as a possible beginning of a flight, but
+# every other, after twice as many every fourth. Ten times less would blur instants of
+# soft impacts.
 RECENT = 64
-# Share of the extent below which the division takes no noise. Ten times less would lose digits of
-# chi^2 to rounding.
+# Share of the extent below which the division takes no noise. Ten times less would lose
+# digits of chi^2 to rounding.
 LEAST_NOISE = 1e-7
 
 
 def price(frames: int, n: int) -> float:
-    """Price of a flight in chi^2: `(2n + 1) ln T` (BIC of 2n values and an instant) of T `frames`.
+    """Price of a flight in chi^2: `(2n + 1) ln T` (BIC of 2n values and an instant) of
+    T `frames`.
 
     At least `SMALLEST_JUMP^2`.
     """
@@ -38,17 +43,20 @@ def price(frames: int, n: int) -> float:
 
 @dataclass(frozen=True)
 class Division:
-    """Flights (frames of each), and the cost of the cheapest division: chi^2 and prices."""
+    """Flights (frames of each), and the cost of the cheapest division: chi^2 and
+    prices.
+    """
 
     flights: list[np.ndarray]
     cost: float
 
 
 def divided(frames: Frames, acceleration: np.ndarray, shortest: int) -> Division:
-    """The cheapest division; a flight has at least `shortest` frames seen in every coordinate.
+    """The cheapest division; a flight has at least `shortest` frames seen in every
+    coordinate.
 
-    Equation: `best_j = min(best_(j-1) + lost, min_i best_i + price + chi^2(i..j))`: frame j is
-    lost, or the last one of a flight from i; dynamic programming.
+    Equation: `best_j = min(best_(j-1) + lost, min_i best_i + price + chi^2(i..j))`:
+    frame j is lost, or the last one of a flight from i; dynamic programming.
     """
     search = _Search(frames, acceleration, shortest)
     for first in range(0, len(frames.t), BLOCK):
@@ -58,10 +66,11 @@ def divided(frames: Frames, acceleration: np.ndarray, shortest: int) -> Division
 
 @dataclass
 class _Starts:
-    """Frames i (C,) at which flights may begin, and sums (6, C, n) over the frames since then.
+    """Frames i (C,) at which flights may begin, and sums (6, C, n) over the frames
+    since then.
 
-    Sums are those of w, w x, w x^2, w y, w x y, w y^2; w is 1 where a frame was seen, x the time,
-    y the place less that of the acceleration, in sigma, both from an origin.
+    Sums are those of w, w x, w x^2, w y, w x y, w y^2; w is 1 where a frame was seen, x
+    the time, y the place less that of the acceleration, in sigma, both from an origin.
     """
 
     index: np.ndarray
@@ -81,7 +90,9 @@ class _Starts:
 
 
 class _Search:
-    """State of the search: least cost `best` (T + 1,) of the first j frames, and where from."""
+    """State of the search: least cost `best` (T + 1,) of the first j frames, and where
+    from.
+    """
 
     def __init__(self, frames: Frames, acceleration: np.ndarray, shortest: int) -> None:
         count, n = frames.q.shape
@@ -92,7 +103,8 @@ class _Search:
         self.q = np.where(self.good, frames.q, 0.0)
         self.curve = acceleration / self.sigma
         self.shortest = shortest
-        self.least_spread = float(np.diff(frames.t).min()) ** 2 / 4  # two frames have twice that
+        # two frames have twice that
+        self.least_spread = float(np.diff(frames.t).min()) ** 2 / 4
         self.price = price(count, n)
         self.lost = chi2.isf(LOST_SHARE, n) * self.good.any(axis=1)
         self.best = np.zeros(count + 1)
@@ -112,7 +124,9 @@ class _Search:
         cost = self._costs(sums[:, :, None] + within[:, None, 1:])
         late = index[:, None] > np.arange(some.start, some.stop)
         cost[late] = np.inf
-        begun = np.concatenate([self.best[self.starts.index], np.full(len(new.index), np.inf)])
+        begun = np.concatenate(
+            [self.best[self.starts.index], np.full(len(new.index), np.inf)]
+        )
         old = len(self.starts.index)
         for k, j in enumerate(range(some.start, some.stop)):
             begun[old + k] = self.best[j]
@@ -121,7 +135,10 @@ class _Search:
             left_out = self.best[j] + self.lost[j]
             flown = total[i] + self.price
             self.best[j + 1] = min(left_out, flown)
-            self.come[j + 1] = index[i] if flown < left_out else j
+            if flown < left_out:
+                self.come[j + 1] = index[i]
+            else:
+                self.come[j + 1] = j
         worse = begun + cost[:, -1] + self.price - self.best[some.stop]
         kept = self._kept(index, worse, some.stop)
         self.starts = _Starts(index[kept], sums[:, kept] + within[:, None, -1])
@@ -138,7 +155,9 @@ class _Search:
         return found[::-1]
 
     def _place(self, k: int) -> np.ndarray:
-        """Place (n,) where each coordinate is seen first from frame k on; the last origin else."""
+        """Place (n,) where each coordinate is seen first from frame k on; the last
+        origin else.
+        """
         some = slice(k, k + BLOCK)
         first = k + self.good[some].argmax(axis=0)
         each = np.arange(self.q.shape[1])
@@ -155,15 +174,20 @@ class _Search:
         self.place = place
 
     def _sums_of(self, some: slice) -> np.ndarray:
-        """Sums (6, B + 1, n) of `_Starts` from the start of a block to each of its frames."""
+        """Sums (6, B + 1, n) of `_Starts` from the start of a block to each of its
+        frames.
+        """
         w = self.good[some].astype(float)
         x = (self.t[some] - self.time)[:, None]
         y = w * ((self.q[some] - self.place) / self.sigma - self.curve * x**2 / 2)
         terms = np.stack([w, w * x, w * x**2, y, x * y, y * y])
-        return np.concatenate([np.zeros_like(terms[:, :1]), terms.cumsum(axis=1)], axis=1)
+        return np.concatenate(
+            [np.zeros_like(terms[:, :1]), terms.cumsum(axis=1)], axis=1
+        )
 
     def _costs(self, sums: np.ndarray) -> np.ndarray:
-        """chi^2 (C, B) of flights from their sums (6, C, B, n); inf where too few were seen.
+        """chi^2 (C, B) of flights from their sums (6, C, B, n); inf where too few were
+        seen.
 
         Equation: of a line in every coordinate,
         `S_yy - S_y^2 / S - (S_xy - S_x S_y / S)^2 / (S_xx - S_x^2 / S)`.
@@ -171,13 +195,15 @@ class _Search:
         w, x, xx, y, xy, yy = sums
         enough = w.min(axis=2) >= self.shortest - 0.5
         w = np.maximum(w, 1.0)
-        spread = np.maximum(xx - x * x / w, self.least_spread)  # 0 of one frame: not enough
+        # 0 of one frame: not enough
+        spread = np.maximum(xx - x * x / w, self.least_spread)
         shared = xy - x * y / w
         cost = (yy - y * y / w - shared * shared / spread).sum(axis=2)
         return np.where(enough, np.maximum(cost, 0.0), np.inf)
 
     def _kept(self, index: np.ndarray, worse: np.ndarray, end: int) -> np.ndarray:
-        """True (C,) for starts that stay: recent ones, good ones, and older ones ever more rarely.
+        """True (C,) for starts that stay: recent ones, good ones, and older ones ever
+        more rarely.
 
         Good: with a flight from there on the cost is `worse` by less than half a price.
         """

@@ -1,7 +1,8 @@
 """What forces that depend on velocity add to a ballistic arc between the same ends.
 
-With `a = g - k |v| v + f(v)` a flight is the arc of g plus D, `D'' = -k |v| v + f(v)`, D = 0 at
-both ends. D'' is a polynomial through Chebyshev points, found by Picard's iteration.
+With `a = g - k |v| v + f(v)` a flight is the arc of g plus D, `D'' = -k |v| v + f(v)`,
+D = 0 at both ends. D'' is a polynomial through Chebyshev points, found by Picard's
+iteration.
 """
 
 from collections.abc import Callable
@@ -10,14 +11,15 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.integrate import cumulative_trapezoid
 
-# Chebyshev points of a flight. |v| v has a bend where a ball turns: with 24 D is within 1e-4 of its
-# size. Ten times more is not seen beside noise.
+# Chebyshev points of a flight. |v| v has a bend where a ball turns: with 24 D is within
+# 1e-4 of its size. Ten times more is not seen beside noise.
 NODES = 24
 ROUNDS = 60  # of Picard; each gains a factor of about 2 / (k |v| h), h the duration
 SETTLED = 1e-12  # of the length of a flight; ten times more is still far below noise
 DIVERGED = 1e6  # lengths of a flight; ten times more would still be far from overflow
-# Share of a length, a duration, an acceleration, by which difference quotients move. Ten times more
-# makes errors of D of 1e-3 in slopes, which are small beside those of the arc.
+# Share of a length, a duration, an acceleration, by which difference quotients move.
+# Ten times more makes errors of D of 1e-3 in slopes, which are small beside those of
+# the arc.
 STEP = 1e-4
 
 _POINTS = chebyshev.chebpts1(NODES)
@@ -25,9 +27,11 @@ _FIT = np.linalg.inv(chebyshev.chebvander(_POINTS, NODES - 1))
 
 
 def _twice_integrated() -> np.ndarray:
-    """Matrix (NODES + 2, NODES) from Chebyshev coefficients of D'' to those of D, D(-1) = D(1) = 0.
+    """Matrix (NODES + 2, NODES) from Chebyshev coefficients of D'' to those of D, D(-1)
+    = D(1) = 0.
 
-    The line through the ends of the second integral is taken away: coefficients 0 and 1.
+    The line through the ends of the second integral is taken away: coefficients 0 and
+    1.
     """
     integrals = chebyshev.chebint(np.eye(NODES), 2)
     left, right = (chebyshev.chebval(end, integrals) for end in (-1.0, 1.0))
@@ -36,8 +40,8 @@ def _twice_integrated() -> np.ndarray:
     return integrals
 
 
-# Matrices from values of D'' at the points: to coefficients of D and of D', to D' at the points and
-# at both ends
+# Matrices from values of D'' at the points: to coefficients of D and of D', to D' at
+# the points and at both ends
 _TWICE = _twice_integrated() @ _FIT
 _ONCE = chebyshev.chebder(_TWICE)
 _RATES = chebyshev.chebvander(_POINTS, NODES) @ _ONCE
@@ -52,10 +56,11 @@ def bent(
     k: np.ndarray,
     force: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Deviation D (B, F, n) [m] of B flights by drag at times x (F,), D' at both ends (B, 2, n).
+    """Deviation D (B, F, n) [m] of B flights by drag at times x (F,), D' at both ends
+    (B, 2, n).
 
-    Equation: `D'' = -k |v| v + f(v)`, v the velocity of the arc without drag plus D', at Chebyshev
-    points; Picard: D'' from the last D'.
+    Equation: `D'' = -k |v| v + f(v)`, v the velocity of the arc without drag plus D',
+    at Chebyshev points; Picard: D'' from the last D'.
 
     Args:
         x: times (F,).
@@ -70,7 +75,8 @@ def bent(
     """
     h = np.diff(tau)[:, :, None]
     chord = np.diff(places, axis=1)
-    arc = chord / h + a[:, None] * h / 2 * _POINTS[:, None]  # velocity of the arc at the points
+    # velocity of the arc at the points
+    arc = chord / h + a[:, None] * h / 2 * _POINTS[:, None]
     slowing = np.zeros_like(arc)
     length = np.abs(arc).max() * h.max()
     for _ in range(ROUNDS):
@@ -84,9 +90,12 @@ def bent(
             break
     if not moved <= 1e-6 * length:
         raise ValueError(
-            f"Argument `drag` must be a coefficient [1/m], `acceleration` a function, that bends "
-            f"flights little, but drag {float(np.max(np.abs(k))):.3g} is too much for a flight "
-            f"of {float(h.max()):.3g} s at {float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
+            f"Argument `drag` must be a coefficient [1/m], `acceleration` a function, "
+            f"that bends "
+            f"flights little, but drag {float(np.max(np.abs(k))):.3g} is too much for "
+            f"a flight "
+            f"of {float(h.max()):.3g} s at "
+            f"{float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
         )
     u = 2 * (x - tau[:, :1]) / h[:, 0] - 1
     D = (h / 2) ** 2 * (chebyshev.chebvander(u, NODES + 1) @ (_TWICE @ slowing))
@@ -103,13 +112,15 @@ def bent_slopes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (F, n, P) of D and (2, n, P) of D' at the ends of one flight.
 
-    In P = 3 n + 3 values: place and instant of the first end, of the last one, acceleration, drag.
-    By difference quotients: all P + 1 flights at once, each with one value moved.
+    In P = 3 n + 3 values: place and instant of the first end, of the last one,
+    acceleration, drag. By difference quotients: all P + 1 flights at once, each with
+    one value moved.
     """
     n = len(a)
     h = tau[1] - tau[0]
     length = np.linalg.norm(places[1] - places[0]) + np.linalg.norm(a) * h**2 / 2
-    length = length if length > 0 else 1.0
+    if not (length > 0):
+        length = 1.0
     end = [length] * n + [h]
     sizes = STEP * np.array(end + end + [length / h**2] * n + [1 / length])
     moves = np.vstack([np.zeros(len(sizes)), np.diag(sizes)])
@@ -129,10 +140,11 @@ def bent_slopes(
 def straightened(
     t: np.ndarray, q: np.ndarray, air: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Places (T, n) [m] as they were without the acceleration `air(v)`: `q - int int air(v)`.
+    """Places (T, n) [m] as they were without the acceleration `air(v)`:
+    `q - int int air(v)`.
 
-    Up to lines. Velocities are those over four frames: good enough to find flights; near an impact
-    they are wrong, but only for two frames.
+    Up to lines. Velocities are those over four frames: good enough to find flights;
+    near an impact they are wrong, but only for two frames.
     """
     whole = between(t, t, q)
     frames = np.arange(len(t))
@@ -144,7 +156,9 @@ def straightened(
 
 
 def between(times: np.ndarray, t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Places (F, n) at `times` (F,), linear between those frames (t, q) that were seen."""
+    """Places (F, n) at `times` (F,), linear between those frames (t, q) that were
+    seen.
+    """
     seen = np.isfinite(q)
     columns = [np.interp(times, t[ok], x[ok]) for x, ok in zip(q.T, seen.T)]
     return np.stack(columns, axis=1)

@@ -1,10 +1,12 @@
-"""How many impacts a track has evidence for, and how large the errors of its places are.
+"""How many impacts a track has evidence for, and how large the errors of its places
+are.
 
-A candidate is an impact where its two flights cost less than one: `r^T C^-1 r + log |C|` of their
-residuals, C the covariance of the errors, and a price for each flight. C has waves where residuals
-show them: then a jump of velocity counts against what flights do without one. Waves and impacts
-explain one another, so that both are found by turns, once from no waves on, once from the largest
-ones; what costs less in all is taken.
+A candidate is an impact where its two flights cost less than one:
+`r^T C^-1 r + log |C|` of their residuals, C the covariance of the errors, and a price
+for each flight. C has waves where residuals show them: then a jump of velocity counts
+against what flights do without one. Waves and impacts explain one another, so that both
+are found by turns, once from no waves on, once from the largest ones; what costs less
+in all is taken.
 """
 
 from collections.abc import Sequence
@@ -19,45 +21,51 @@ from jimpact.tracks.flight import Flight
 from jimpact.tracks.frames import Frames, least_noise, noise
 from jimpact.tracks.waves import Covariance, Errors
 
-# Cost by which a flight of another acceleration must be better than an impact to take it away, and
-# an impact better than it not to be doubtful; by chance one in a thousand gains less. Ten times
-# more would doubt soft impacts; ten times less, and drag would pass as impacts.
+# Cost by which a flight of another acceleration must be better than an impact to take
+# it away, and an impact better than it not to be doubtful; by chance one in a thousand
+# gains less. Ten times more would doubt soft impacts; ten times less, and drag would
+# pass as impacts.
 LEAST_GAIN = 10.8
-# Cost that each impact must save beside its price where waves explain the track without it. Waves
-# of lenses and tables are smoother than those of the model, so that impacts would take their place;
-# ten times more would lose impacts of 15 standard errors.
+# Cost that each impact must save beside its price where waves explain the track without
+# it. Waves of lenses and tables are smoother than those of the model, so that impacts
+# would take their place; ten times more would lose impacts of 15 standard errors.
 RATHER_FEW = LEAST_GAIN
 ROUNDS = 8  # of impacts and waves by turns; three are common
-# Smallest size of waves, in sigma, and their times as shares of the longest flight. Shares of ten
-# in the place of three miss waves by half of their likelihood.
+# Smallest size of waves, in sigma, and their times as shares of the longest flight.
+# Shares of ten in the place of three miss waves by half of their likelihood.
 SMALLEST_WAVES = 0.3
 SHARES = 0.3 * 3.0 ** -np.arange(5)
 FINER = (3.0**-0.5, 3.0**0.5)  # of the best size, the same of its time
-# Velocity of waves, their size over their time, as a share of the speed of the flights: more are no
-# errors of places. Ten times more would take bounces for waves, ten times less would take the waves
-# of most lenses for impacts.
+# Velocity of waves, their size over their time, as a share of the speed of the flights:
+# more are no errors of places. Ten times more would take bounces for waves, ten times
+# less would take the waves of most lenses for impacts.
 WAVE_SPEED = 0.05
 WAVED = (
-    3.0  # candidates that the first waves are long, as they part a wave; ten times more part none
+    # candidates that the first waves are long, as they part a wave; ten times more part
+    # none
+    3.0
 )
 # Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
 LEAST_TIME = 15.0
-LEAST_MEANS = 4.0  # of means of frames; ten times more would miss waves of half a flight
-# Share of the frames in flights that are not held from which on those that bend make all bend. A
-# tenth of it would free all flights of a body that slides at times.
+# of means of frames; ten times more would miss waves of half a flight
+LEAST_MEANS = 4.0
+# Share of the frames in flights that are not held from which on those that bend make
+# all bend. A tenth of it would free all flights of a body that slides at times.
 MOSTLY = 0.4
 TURNS = 2  # of white errors beside waves; more change them by less than a hundredth
-# Share of the diagonal of normal matrices by which they are kept from being singular where a flight
-# has one frame. Ten times more is still far below noise.
+# Share of the diagonal of normal matrices by which they are kept from being singular
+# where a flight has one frame. Ten times more is still far below noise.
 ROUNDED = 1e-12
-# Frames by which waves are looked for; more are taken together. Ten times more take ten times as
-# long, and waves are slow.
+# Frames by which waves are looked for; more are taken together. Ten times more take ten
+# times as long, and waves are slow.
 MOST_FRAMES = 150
-# Frames whose means are looked at for waves, and standard deviations by which they must be larger
-# than those of white errors. Twice as many would miss waves as large as the noise.
+# Frames whose means are looked at for waves, and standard deviations by which they must
+# be larger than those of white errors. Twice as many would miss waves as large as the
+# noise.
 BINS = (4, 16, 64, 256)
 SHOWN = 2.5
-# Cost that waves must save: BIC of their size and time, and what one good track in a hundred saves.
+# Cost that waves must save: BIC of their size and time, and what one good track in a
+# hundred saves.
 LEAST_SAVED = 4.0
 
 
@@ -66,8 +74,8 @@ class Verdict:
     """What is left of candidates.
 
     Fields: flights; their model; errors of places; `bent` (F, n), where a flight has an
-    acceleration of its own; how many candidates `errors` alone make, and how many a flight of
-    another acceleration explains.
+    acceleration of its own; how many candidates `errors` alone make, and how many a
+    flight of another acceleration explains.
     """
 
     flights: list[np.ndarray]
@@ -79,20 +87,26 @@ class Verdict:
 
 
 def price_of_bend(frames: int) -> float:
-    """Price of an acceleration of a flight's own in one coordinate: `ln T`, and LEAST_GAIN."""
+    """Price of an acceleration of a flight's own in one coordinate: `ln T`, and
+    LEAST_GAIN.
+    """
     return float(np.log(frames)) + LEAST_GAIN
 
 
 class FlightCosts:
-    """`r^T C^-1 r` and `log |C|` of flights, each by itself: on lines, on parabolas, on the
-    cheaper.
+    """`r^T C^-1 r` and `log |C|` of flights, each by itself: on lines, on parabolas, on
+    the cheaper.
 
     A parabola of a coordinate has a price in the last. `flights` are lists of frames,
     `acceleration` (n,) what is known of it.
     """
 
     def __init__(
-        self, frames: Frames, flights: Sequence[np.ndarray], flight: Flight, errors: Errors
+        self,
+        frames: Frames,
+        flights: Sequence[np.ndarray],
+        flight: Flight,
+        errors: Errors,
     ) -> None:
         self.line = np.zeros(len(flights))
         self.parabola = np.zeros(len(flights))
@@ -116,8 +130,9 @@ class FlightCosts:
 class Coordinate:
     """Frames of one coordinate in all flights, in turn: what a line leaves of them.
 
-    Fields: times t (N,); `rest` (N,) of the least squares of a line in each flight; `curve` (N,),
-    t^2 / 2 without its line; `starts` (F,); `flights` (F,), their numbers.
+    Fields: times t (N,); `rest` (N,) of the least squares of a line in each flight;
+    `curve` (N,), t^2 / 2 without its line; `starts` (F,); `flights` (F,), their
+    numbers.
     """
 
     t: np.ndarray
@@ -142,7 +157,14 @@ class Coordinate:
         since = t - _mean(t, starts)
         places = frames.q[rows, c] - flight.acceleration[c] * since**2 / 2
         curve = _without_line(since, since**2 / 2, starts)
-        return cls(t, since, curve, _without_line(since, places, starts), starts, number[starts])
+        return cls(
+            t,
+            since,
+            curve,
+            _without_line(since, places, starts),
+            starts,
+            number[starts],
+        )
 
     @property
     def counts(self) -> np.ndarray:
@@ -151,18 +173,27 @@ class Coordinate:
 
     def grams(self, covariance: Covariance) -> np.ndarray:
         """`X^T C^-1 X` (F, 4, 4) of each flight, X of (1, t, curve, rest)."""
-        terms = np.column_stack([np.ones_like(self.t), self.since, self.curve, self.rest])
+        terms = np.column_stack(
+            [np.ones_like(self.t), self.since, self.curve, self.rest]
+        )
         products = terms[:, :, None] * covariance.solve(terms)[:, None]
         return np.add.reduceat(products, self.starts, axis=0)
 
     def at_best(self, acceleration: float) -> tuple["Coordinate", float]:
-        """The same at the best common acceleration, and this; `acceleration`: that taken away."""
+        """The same at the best common acceleration, and this; `acceleration`: that
+        taken away.
+        """
         size = float(self.curve @ self.curve)
-        more = float(self.curve @ self.rest) / size if size > 0 else 0.0
+        if size > 0:
+            more = float(self.curve @ self.rest) / size
+        else:
+            more = 0.0
         return replace(self, rest=self.rest - more * self.curve), acceleration + more
 
     def together(self, most: int) -> tuple["Coordinate", int]:
-        """Means of so many frames in a row that `most` are left, and of how many each is."""
+        """Means of so many frames in a row that `most` are left, and of how many each
+        is.
+        """
         size = max(1, len(self.t) // most)
         size = min(size, max(1, int(self.counts.min()) // 4))
         if size == 1:
@@ -189,7 +220,9 @@ def _mean(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _without_line(since: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """What least squares of a line in each flight leave of y (N,); `since` has mean 0 there."""
+    """What least squares of a line in each flight leave of y (N,); `since` has mean 0
+    there.
+    """
     counts = np.diff(np.append(starts, len(y)))
     y = y - _mean(y, starts)
     size = np.add.reduceat(since * since, starts)
@@ -198,18 +231,23 @@ def _without_line(since: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.nd
 
 
 def _rest(grams: np.ndarray, terms: int) -> np.ndarray:
-    """`r^T C^-1 r` (F,) that so many terms of `Coordinate.grams` leave, by least squares."""
+    """`r^T C^-1 r` (F,) that so many terms of `Coordinate.grams` leave, by least
+    squares.
+    """
     normal = grams[:, :terms, :terms]
     right = grams[:, :terms, -1]
     scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
     normal = normal * scale[:, :, None] * scale[:, None]
     right = right * scale
     normal = normal + ROUNDED * np.eye(terms)
-    explained = (right * np.linalg.solve(normal, right[:, :, None])[:, :, 0]).sum(axis=1)
+    explained = (right * np.linalg.solve(normal, right[:, :, None])[:, :, 0]).sum(
+        axis=1
+    )
     return np.maximum(grams[:, -1, -1] - explained, 0.0)
 
 
-# ----------------------------------------------------------------------------- errors of places
+# ----------------------------------------------------------------------------- errors
+# of places
 
 
 def likely_errors(
@@ -219,11 +257,13 @@ def likely_errors(
     estimated: bool,
     speeds: np.ndarray,
 ) -> tuple[Errors, Flight, np.ndarray]:
-    """Most likely errors of places in these flights: white ones, if `estimated`, and waves.
+    """Most likely errors of places in these flights: white ones, if `estimated`, and
+    waves.
 
-    And the model, and the coordinates (F, n) in which flights have accelerations of their own,
-    where that costs less. Waves by restricted likelihood, as each flight has a line or a parabola;
-    lines or parabolas by the likelihood; the prices are BIC's. `speeds` (n,): of the flights.
+    And the model, and the coordinates (F, n) in which flights have accelerations of
+    their own, where that costs less. Waves by restricted likelihood, as each flight has
+    a line or a parabola; lines or parabolas by the likelihood; the prices are BIC's.
+    `speeds` (n,): of the flights.
     """
     n = len(frames.sigma)
     sigma = frames.sigma.copy()
@@ -241,7 +281,10 @@ def likely_errors(
             continue
         if flight.unknown[c]:
             some, acceleration[c] = some.at_best(acceleration[c])
-        known = None if estimated else sigma[c]
+        if estimated:
+            known = None
+        else:
+            known = sigma[c]
         none = np.zeros(len(some.starts), bool)
         on_lines = Likelihood(some, known, least[c], WAVE_SPEED * speeds[c], none)
         found = on_lines.most_likely(frames.step)
@@ -276,13 +319,19 @@ def likely_errors(
     return Errors(sigma, waves, times), model, bent
 
 
-def held_rather(frames: Frames, flights: Sequence[np.ndarray], flight: Flight) -> np.ndarray:
-    """True (F,) for flights nearer to no acceleration than to a known one, in some coordinate."""
+def held_rather(
+    frames: Frames, flights: Sequence[np.ndarray], flight: Flight
+) -> np.ndarray:
+    """True (F,) for flights nearer to no acceleration than to a known one, in some
+    coordinate.
+    """
     held = np.zeros(len(flights), bool)
     for c in map(int, np.flatnonzero(flight.acceleration * ~flight.unknown)):
         some = Coordinate.of(frames, flights, flight, c)
         size = np.add.reduceat(some.curve**2, some.starts)
-        excess = np.add.reduceat(some.curve * some.rest, some.starts) / np.maximum(size, 1e-300)
+        excess = np.add.reduceat(some.curve * some.rest, some.starts) / np.maximum(
+            size, 1e-300
+        )
         own = flight.acceleration[c]
         held[some.flights] |= np.abs(excess + own) < abs(own) / 2
     return held
@@ -291,8 +340,8 @@ def held_rather(frames: Frames, flights: Sequence[np.ndarray], flight: Flight) -
 class Likely(NamedTuple):
     """The most likely errors of a coordinate: white sigma, size and time of waves [s].
 
-    `cost`: -2 log of the restricted likelihood; `evidence`: of the likelihood, with the price of
-    waves.
+    `cost`: -2 log of the restricted likelihood; `evidence`: of the likelihood, with the
+    price of waves.
     """
 
     cost: float
@@ -304,8 +353,8 @@ class Likely(NamedTuple):
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Likelihood of the errors of a coordinate on lines, or parabolas where flights are `bent`
-    (F,).
+    """Likelihood of the errors of a coordinate on lines, or parabolas where flights are
+    `bent` (F,).
 
     sigma None: unknown, at least `least`; `fastest`: velocity of waves at most.
     """
@@ -322,7 +371,9 @@ class Likelihood:
         return 2 * len(self.bent) + int(self.bent.sum())
 
     def curved(self) -> np.ndarray:
-        """True (F,) for flights on parabolas rather than lines, by white errors, at their price."""
+        """True (F,) for flights on parabolas rather than lines, by white errors, at
+        their price.
+        """
         all_bent = replace(self, bent=self.some.counts > 3)
         sigma = all_bent.white().sigma
         white = Covariance(self.some.t, self.some.starts, sigma, 0.0, 1.0)
@@ -331,12 +382,17 @@ class Likelihood:
         return all_bent.bent & (gain > price_of_bend(len(self.some.t)))
 
     def most_likely(self, step: float) -> Likely:
-        """The most likely errors; waves of size 0 unless they save their price. `step`: [s]."""
+        """The most likely errors; waves of size 0 unless they save their price. `step`:
+        [s].
+        """
         white = self.at(0.0, 1.0)
         if not self.shows_waves(self.white().sigma):
             return white
         few, size = self.some.together(MOST_FRAMES)
-        known = None if self.sigma is None else self.sigma / size**0.5
+        if self.sigma is None:
+            known = None
+        else:
+            known = self.sigma / size**0.5
         binned = Likelihood(few, known, self.least / size**0.5, self.fastest, self.bent)
         best = binned.best_waves(step * max(LEAST_TIME, LEAST_MEANS * size))
         saved = binned.white().cost - best.cost
@@ -345,7 +401,8 @@ class Likelihood:
         return self._beside(best)
 
     def white(self) -> Likely:
-        """Errors without waves: sigma as given, unless residuals show clearly larger ones.
+        """Errors without waves: sigma as given, unless residuals show clearly larger
+        ones.
 
         Waves must explain more than these.
         """
@@ -356,7 +413,9 @@ class Likelihood:
         larger = shown.sigma > self.sigma
         saved = given.cost - shown.cost
         enough = saved > np.log(len(self.some.t)) + LEAST_SAVED
-        return shown if larger and enough else given
+        if larger and enough:
+            return shown
+        return given
 
     @property
     def price_of_waves(self) -> float:
@@ -364,15 +423,19 @@ class Likelihood:
         return 2 * float(np.log(len(self.some.t))) + LEAST_SAVED
 
     def shows_waves(self, sigma: float) -> bool:
-        """True if means of 4, 16, 64, .. frames in a row are larger than white errors make them.
+        """True if means of 4, 16, 64, .. frames in a row are larger than white errors
+        make them.
 
-        By SHOWN standard deviations of the sum of their squares; else waves are not looked for.
+        By SHOWN standard deviations of the sum of their squares; else waves are not
+        looked for.
         """
         rest = self.some.rest
         if self.bent.any():
             curve = self.some.curve * np.repeat(self.bent, self.some.counts)
             size = np.add.reduceat(curve * curve, self.some.starts)
-            share = np.add.reduceat(curve * rest, self.some.starts) / np.maximum(size, 1e-300)
+            share = np.add.reduceat(curve * rest, self.some.starts) / np.maximum(
+                size, 1e-300
+            )
             rest = rest - np.repeat(share, self.some.counts) * curve
         some = replace(self.some, rest=rest)
         for frames in BINS:
@@ -387,7 +450,9 @@ class Likelihood:
 
     def best_waves(self, shortest: float) -> Likely:
         """The most likely waves with a time above `shortest` [s]."""
-        spans = np.add.reduceat(np.diff(self.some.t, append=self.some.t[-1]), self.some.starts)
+        spans = np.add.reduceat(
+            np.diff(self.some.t, append=self.some.t[-1]), self.some.starts
+        )
         longest = min(float(spans.max()), float(np.ptp(self.some.t)))
         times = longest * SHARES
         best = self.at(0.0, 1.0)
@@ -405,7 +470,8 @@ class Likelihood:
         return best
 
     def _best_size(self, ratio: float, time: float) -> Likely:
-        """The best size of waves with this time, uphill from `ratio` in steps, then within one.
+        """The best size of waves with this time, uphill from `ratio` in steps, then
+        within one.
 
         Their velocity, the size over the time, is `fastest` at most.
         """
@@ -447,12 +513,21 @@ class Likelihood:
             sigma = max(float(np.sqrt(square / freedom)), self.least)
         chi = square / sigma**2
         cost = chi + 2 * freedom * np.log(sigma) + log_det
-        evidence = chi + 2 * len(self.some.t) * np.log(sigma) + covariance.log_det().sum()
-        of_waves = self.price_of_waves if ratio else 0.0
-        return Likely(float(cost), sigma, ratio * sigma, time, float(evidence) + of_waves)
+        evidence = (
+            chi + 2 * len(self.some.t) * np.log(sigma) + covariance.log_det().sum()
+        )
+        if ratio:
+            of_waves = self.price_of_waves
+        else:
+            of_waves = 0.0
+        return Likely(
+            float(cost), sigma, ratio * sigma, time, float(evidence) + of_waves
+        )
 
     def _beside(self, best: Likely) -> Likely:
-        """White errors beside the waves `best`, by turns from those of differences on."""
+        """White errors beside the waves `best`, by turns from those of differences
+        on.
+        """
         if self.sigma is not None:
             return self.at(best.wave / self.sigma, best.time)
         free = replace(self, sigma=None)
@@ -462,13 +537,15 @@ class Likelihood:
         return replace(self, sigma=sigma).at(best.wave / sigma, best.time)
 
 
-# ------------------------------------------------------------------------------ which are impacts
+# ------------------------------------------------------------------------------ which
+# are impacts
 
 
 def judged(
     frames: Frames, flights: Sequence[np.ndarray], flight: Flight, estimated: bool
 ) -> Verdict:
-    """The impacts among candidates, the ends of `flights`, and the errors of the places.
+    """The impacts among candidates, the ends of `flights`, and the errors of the
+    places.
 
     From two starts, no waves and the largest ones; what costs less is taken.
     """
@@ -483,8 +560,11 @@ def judged(
     return _cheapest(frames, found)
 
 
-def largest_waves(frames: Frames, flights: Sequence[np.ndarray], speeds: np.ndarray) -> Errors:
-    """Waves as fast as WAVE_SPEED allows, over WAVED candidates: a start from few impacts.
+def largest_waves(
+    frames: Frames, flights: Sequence[np.ndarray], speeds: np.ndarray
+) -> Errors:
+    """Waves as fast as WAVE_SPEED allows, over WAVED candidates: a start from few
+    impacts.
 
     None where no flight is long enough for them.
     """
@@ -497,15 +577,24 @@ def largest_waves(frames: Frames, flights: Sequence[np.ndarray], speeds: np.ndar
 
 
 def _cheapest(frames: Frames, found: Sequence[Verdict]) -> Verdict:
-    """The verdict of least cost; where one has waves impacts must save RATHER_FEW beside."""
+    """The verdict of least cost; where one has waves impacts must save RATHER_FEW
+    beside.
+    """
     waves = any(verdict.errors.waves.any() for verdict in found)
-    of_each = RATHER_FEW if waves else 0.0
-    return min(found, key=lambda some: _cost(frames, some) + of_each * len(some.flights))
+    if waves:
+        of_each = RATHER_FEW
+    else:
+        of_each = 0.0
+    return min(
+        found, key=lambda some: _cost(frames, some) + of_each * len(some.flights)
+    )
 
 
 @dataclass(frozen=True)
 class _Task:
-    """Candidates to be judged: frames, flights between them, is sigma estimated, their speeds."""
+    """Candidates to be judged: frames, flights between them, is sigma estimated, their
+    speeds.
+    """
 
     frames: Frames
     flights: Sequence[np.ndarray]
@@ -518,10 +607,14 @@ class _Task:
         """Errors of places, the model and which flights are bent, by some flights."""
         return likely_errors(self.frames, flights, flight, self.estimated, self.speeds)
 
-    def settled(self, errors: Errors, model: Flight, other: Verdict | None = None) -> Verdict:
-        """Impacts and errors that agree, from these errors on; `other` where impacts are the same.
+    def settled(
+        self, errors: Errors, model: Flight, other: Verdict | None = None
+    ) -> Verdict:
+        """Impacts and errors that agree, from these errors on; `other` where impacts
+        are the same.
 
-        Of the rounds that which costs least: joined flights that fit badly would join more.
+        Of the rounds that which costs least: joined flights that fit badly would join
+        more.
         """
         verdict = _joined(self.frames, self.flights, model, errors)
         if other is not None and len(other.flights) == len(verdict.flights):
@@ -587,7 +680,9 @@ def _of_pairs(
     """Costs (F - 1,) of neighbouring flights as one."""
     pairs = [np.concatenate(two) for two in pairwise(flights)]
     costs = [
-        FlightCosts(frames, some, flight, errors) for some in (pairs[::2], pairs[1::2]) if some
+        FlightCosts(frames, some, flight, errors)
+        for some in (pairs[::2], pairs[1::2])
+        if some
     ]
     whole = costs[0]
     for name in ("line", "parabola", "least"):
@@ -601,7 +696,9 @@ def _of_pairs(
 def doubtful(
     frames: Frames, flights: Sequence[np.ndarray], flight: Flight, errors: Errors
 ) -> np.ndarray:
-    """True (K,) for impacts that a flight of another acceleration explains about as well."""
+    """True (K,) for impacts that a flight of another acceleration explains about as
+    well.
+    """
     if len(flights) < 2:
         return np.zeros(0, bool)
     flights = list(flights)

@@ -1,4 +1,6 @@
-"""The model of a flight between two impacts: acceleration, drag of the air, force of spin."""
+"""The model of a flight between two impacts: acceleration, drag of the air, force of
+spin.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,8 +17,8 @@ Force = Callable[[np.ndarray], np.ndarray]  # acceleration (..., n) of velocity 
 class Flight:
     """Accelerations of all flights: `a - k |v| v + f(v)`.
 
-    Fields: acceleration a (n,), `unknown` (n,) where it is to be found; drag k [1/m], and whether
-    it is unknown; `force` f, of velocities (..., n); None: none.
+    Fields: acceleration a (n,), `unknown` (n,) where it is to be found; drag k [1/m],
+    and whether it is unknown; `force` f, of velocities (..., n); None: none.
     """
 
     acceleration: np.ndarray
@@ -45,10 +47,14 @@ class Flight:
         return replace(self, acceleration=acceleration, drag=drag)
 
     def moved(self, change: np.ndarray) -> "Flight":
-        """The same model after a change of what is unknown, in the order of `columns`."""
+        """The same model after a change of what is unknown, in the order of
+        `columns`.
+        """
         whole = np.zeros(len(self.acceleration) + 1)
         whole[self.columns] = change
-        return self.with_values(self.acceleration + whole[:-1], self.drag + float(whole[-1]))
+        return self.with_values(
+            self.acceleration + whole[:-1], self.drag + float(whole[-1])
+        )
 
     def air(self, drag: float) -> Force:
         """Acceleration that velocity makes, at a drag: `f(v) - k |v| v`."""
@@ -56,16 +62,20 @@ class Flight:
         def accelerations(v: np.ndarray) -> np.ndarray:
             """Acceleration (..., n) of velocities (..., n)."""
             slowing = -drag * np.linalg.norm(v, axis=-1, keepdims=True) * v
-            return slowing if self.force is None else slowing + self.force(v)
+            if self.force is None:
+                return slowing
+            return slowing + self.force(v)
 
         return accelerations
 
     def deviation(
         self, x: np.ndarray, tau: np.ndarray, places: np.ndarray, own: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Deviation D (F, n) of a flight from its parabola at times x (F,), D' at its ends (2, n).
+        """Deviation D (F, n) of a flight from its parabola at times x (F,), D' at its
+        ends (2, n).
 
-        tau: times of both ends (2,); places: there (2, n); own: acceleration of its own (n,).
+        tau: times of both ends (2,); places: there (2, n); own: acceleration of its own
+        (n,).
         """
         acceleration = self.acceleration + own
         values = (tau[None], places[None], acceleration[None], np.array([self.drag]))
@@ -75,8 +85,12 @@ class Flight:
     def deviation_slopes(
         self, x: np.ndarray, tau: np.ndarray, places: np.ndarray, own: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives (F, n, P) of D and (2, n, P) of D', P = 3 n + 3, see `bent_slopes`."""
-        return bent_slopes(x, tau, places, self.acceleration + own, self.drag, self.force)
+        """Derivatives (F, n, P) of D and (2, n, P) of D', P = 3 n + 3, see
+        `bent_slopes`.
+        """
+        return bent_slopes(
+            x, tau, places, self.acceleration + own, self.drag, self.force
+        )
 
     def straight(self, frames: Frames) -> Frames:
         """Frames as they were without drag and force, up to a line in each flight."""
@@ -85,10 +99,11 @@ class Flight:
         return frames.with_places(straightened(frames.t, frames.q, self.air(self.drag)))
 
     def fitted_to(self, frames: Frames, flights: list[np.ndarray]) -> "Flight":
-        """The model with what is unknown by least squares in flights that have a line each.
+        """The model with what is unknown by least squares in flights that have a line
+        each.
 
-        Equation: `y = q - a t^2 / 2 - k s`, all without the line of each flight, in sigma; s is
-        what a drag of 1/m adds to the places.
+        Equation: `y = q - a t^2 / 2 - k s`, all without the line of each flight, in
+        sigma; s is what a drag of 1/m adds to the places.
         """
         columns = self.columns
         if not columns.size:
@@ -98,7 +113,9 @@ class Flight:
         places = frames.q
         if self.force is not None:
             places = straightened(frames.t, frames.q, self.air(0.0))
-        added = frames.q - straightened(frames.t, frames.q, replace(self, force=None).air(1.0))
+        added = frames.q - straightened(
+            frames.t, frames.q, replace(self, force=None).air(1.0)
+        )
         normal = np.zeros((n + 1, n + 1))
         right = np.zeros(n + 1)
         for some in flights:
@@ -118,13 +135,18 @@ class Flight:
                 right += square[:-1, -1]
         if not self.drag_unknown:
             right -= normal[:, -1] * self.drag
-        found = np.linalg.pinv(normal[np.ix_(columns, columns)], hermitian=True) @ right[columns]
+        found = (
+            np.linalg.pinv(normal[np.ix_(columns, columns)], hermitian=True)
+            @ right[columns]
+        )
         values = np.append(known, 0.0 if self.drag_unknown else self.drag)
         values[columns] = found
         return self.with_values(values[:-1], float(values[-1]))
 
 
 def without_polynomial(x: np.ndarray, y: np.ndarray, terms: int) -> np.ndarray:
-    """Residual of y (F,) or (F, k) by least squares of polynomials of so many terms in x (F,)."""
+    """Residual of y (F,) or (F, k) by least squares of polynomials of so many terms in
+    x (F,).
+    """
     basis = np.linalg.qr(np.vander(x, terms))[0]
     return np.asarray(y - basis @ (basis.T @ y))

@@ -5,19 +5,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# Share of the extent of a coordinate below which its standard error is not taken: nothing is
-# measured to more than nine digits. Ten times less, and rounding of sums would count.
+# Share of the extent of a coordinate below which its standard error is not taken:
+# nothing is measured to more than nine digits. Ten times less, and rounding of sums
+# would count.
 LEAST_NOISE = 1e-9
-# Steps to which values are compared with whole multiples of a step. Ten times more would take
-# noise of a tenth of a digit for rounding.
+# Steps to which values are compared with whole multiples of a step. Ten times more
+# would take noise of a tenth of a digit for rounding.
 WHOLE = 1e-3
 DIGITS = np.arange(-12, 1)  # powers of ten that are tried as steps of the last digit
-FEW_VALUES = 200  # pixels: so many steps at most between the lowest and the highest value
+# pixels: so many steps at most between the lowest and the highest value
+FEW_VALUES = 200
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Times t (T,) [s], places q (T, n), NaN where lost, and their standard errors sigma (n,).
+    """Times t (T,) [s], places q (T, n), NaN where lost, and their standard errors
+    sigma (n,).
 
     `angles`: coordinates that are angles; none where it is empty.
     """
@@ -38,7 +41,9 @@ class Frames:
         return np.isfinite(self.q).all(axis=1)
 
     def speeds(self, flights: Sequence[np.ndarray]) -> np.ndarray:
-        """Speeds (n,) of these flights, root mean square: that of all places, or of all angles."""
+        """Speeds (n,) of these flights, root mean square: that of all places, or of all
+        angles.
+        """
         n = self.q.shape[1]
         square = np.zeros(n)
         frames = 0
@@ -65,21 +70,27 @@ class Frames:
 def noise(q: np.ndarray) -> np.ndarray:
     """Standard errors (n,) of places (T, n), from their third differences.
 
-    They vanish for a constant acceleration; the median of their sizes, times 1.4826 (normal
-    errors), does not see the few at impacts. The variance of a third difference is 20 sigma^2.
+    They vanish for a constant acceleration; the median of their sizes, times 1.4826
+    (normal errors), does not see the few at impacts. The variance of a third difference
+    is 20 sigma^2.
     """
     sizes = np.array([median(np.abs(differences(x, 3))) for x in q.T])
     return np.maximum(1.4826 * sizes / np.sqrt(20), least_noise(q))
 
 
 def least_noise(q: np.ndarray) -> np.ndarray:
-    """Lowest standard errors (n,) of places (T, n): of rounding, and LEAST_NOISE of the extent.
+    """Lowest standard errors (n,) of places (T, n): of rounding, and LEAST_NOISE of the
+    extent.
 
-    Values rounded to multiples of a step have errors between -step / 2 and step / 2, whose
-    standard deviation is `step / sqrt(12)`.
+    Values rounded to multiples of a step have errors between -step / 2 and step / 2,
+    whose standard deviation is `step / sqrt(12)`.
     """
     extent = np.nanmax(q, axis=0) - np.nanmin(q, axis=0)
-    whole = extent.max() if extent.max() > 0 else 1.0  # where nothing moves any is little
+    # where nothing moves any is little
+    if extent.max() > 0:
+        whole = extent.max()
+    else:
+        whole = 1.0
     rounding = np.array([rounding_step(x[np.isfinite(x)]) for x in q.T]) / np.sqrt(12)
     return np.maximum(rounding, LEAST_NOISE * whole)
 
@@ -94,7 +105,8 @@ def rounding_step(x: np.ndarray) -> float:
         return 0.0
     gaps = np.diff(values)
     least = float(gaps.min())
-    # of three and more digits that are left the step is at most a hundredth of the extent
+    # of three and more digits that are left the step is at most a hundredth of the
+    # extent
     powers = 10.0 ** DIGITS[::-1]
     for step in powers[powers <= 10 * least]:
         if step < 1e-6 * np.abs(values).max():
@@ -110,9 +122,11 @@ def rounding_step(x: np.ndarray) -> float:
 
 
 def differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
-    """Differences of this order, over `step` frames, of places (T,), without those that are NaN.
+    """Differences of this order, over `step` frames, of places (T,), without those that
+    are NaN.
 
-    Where all are, as every other frame is lost, differences of the frames that were seen.
+    Where all are, as every other frame is lost, differences of the frames that were
+    seen.
     """
 
     def all_of(x: np.ndarray) -> np.ndarray:
@@ -122,9 +136,13 @@ def differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
         return x[np.isfinite(x)]
 
     found = all_of(x)
-    return found if found.size else all_of(x[np.isfinite(x)])
+    if found.size:
+        return found
+    return all_of(x[np.isfinite(x)])
 
 
 def median(x: np.ndarray) -> float:
     """The median; 0 of nothing."""
-    return float(np.median(x)) if x.size else 0.0
+    if x.size:
+        return float(np.median(x))
+    return 0.0

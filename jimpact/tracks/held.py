@@ -1,4 +1,5 @@
-"""Flights in which a body is held: it has no acceleration where a flight has a known one.
+"""Flights in which a body is held: it has no acceleration where a flight has a known
+one.
 
 It rests, slides or rolls; its frames are taken for short flights with impacts between.
 """
@@ -11,21 +12,23 @@ from jimpact.tracks.division import SMALLEST_JUMP, price
 from jimpact.tracks.flight import without_polynomial
 from jimpact.tracks.frames import Frames
 
-# Logarithm of the odds, 20 to 1, from which on a body is held in one flight. Ten times more would
-# keep most false flights of a body that slides, of a few frames each.
+# Logarithm of the odds, 20 to 1, from which on a body is held in one flight. Ten times
+# more would keep most false flights of a body that slides, of a few frames each.
 HELD_ODDS = 3.0
-# Logarithm of the likelihood of "held" over "free" from which on flights at an end are left out:
-# half of the square of SMALLEST_JUMP. Ten times more would keep 10 false impacts.
+# Logarithm of the likelihood of "held" over "free" from which on flights at an end are
+# left out: half of the square of SMALLEST_JUMP. Ten times more would keep 10 false
+# impacts.
 HELD = SMALLEST_JUMP**2 / 2
 
 
 def free_flights(
     frames: Frames, acceleration: np.ndarray, flights: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """The flights without those at both ends in which the body is held; at least one is left.
+    """The flights without those at both ends in which the body is held; at least one is
+    left.
 
-    A run of flights at an end is held where one parabola explains it as well (chi^2 and prices of
-    flights), or where the sum of `held_rather` over it exceeds HELD.
+    A run of flights at an end is held where one parabola explains it as well (chi^2 and
+    prices of flights), or where the sum of `held_rather` over it exceeds HELD.
     """
     if not acceleration.any() or len(flights) < 2:
         return flights
@@ -39,9 +42,14 @@ def free_flights(
         return _of_one_parabola(frames, acceleration, whole) - float(alone[run].sum())
 
     def count(order: np.ndarray) -> int:
-        """Number of the first flights in this order that are held, by likelihood or parabola."""
+        """Number of the first flights in this order that are held, by likelihood or
+        parabola.
+        """
         sums = np.cumsum(held[order])
-        curved = int(np.argmax(sums)) + 1 if sums.size and sums.max() > HELD else 0
+        if sums.size and sums.max() > HELD:
+            curved = int(np.argmax(sums)) + 1
+        else:
+            curved = 0
         few = 1
         many = len(order)  # by bisection how many one parabola explains
         while few < many:
@@ -52,21 +60,27 @@ def free_flights(
                 many = middle - 1
         while few > 1 and more(order[:few]) - more(order[: few - 1]) > start:
             few -= 1  # the last one costs more than it would alone
-        straight = few if few > 1 else 0
+        if few > 1:
+            straight = few
+        else:
+            straight = 0
         return max(curved, straight)
 
     last = len(flights) - count(np.arange(len(flights))[::-1])
     first = count(np.arange(last))
-    return flights[first:last] if last > first else flights[:1]
+    if last > first:
+        return flights[first:last]
+    return flights[:1]
 
 
 def held_flights(
     frames: Frames, acceleration: np.ndarray, flights: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """True (F,) for flights in which the body is held: by `held_rather`, or on one parabola.
+    """True (F,) for flights in which the body is held: by `held_rather`, or on one
+    parabola.
 
-    A run of flights is on one parabola as long as each further one, at its price, would cost more
-    by itself.
+    A run of flights is on one parabola as long as each further one, at its price, would
+    cost more by itself.
     """
     if not acceleration.any():
         return np.zeros(len(flights), bool)
@@ -96,8 +110,8 @@ def held_rather(
 ) -> np.ndarray:
     """Log likelihood ratio (F,) of "held" over "free" in each flight.
 
-    Equation: with the excess x of its acceleration over the known a, and the error s of x, the sum
-    of `(x^2 - (x + a)^2) / (2 s^2)` over coordinates.
+    Equation: with the excess x of its acceleration over the known a, and the error s of
+    x, the sum of `(x^2 - (x + a)^2) / (2 s^2)` over coordinates.
     """
     rest = (frames.q - acceleration * frames.t[:, None] ** 2 / 2) / frames.sigma
     excess, error = excess_of(frames.t, rest, frames.sigma, flights)
@@ -118,10 +132,19 @@ def excess_of(
     for i, some in enumerate(flights):
         for c, scale in enumerate(sigma):
             ok = some[np.isfinite(rest[some, c])]
-            x = t[ok] - t[ok].mean() if len(ok) else t[ok]
-            curve = without_polynomial(x, x**2 / 2, 2) if len(ok) > 2 else np.zeros(1)
+            if len(ok):
+                x = t[ok] - t[ok].mean()
+            else:
+                x = t[ok]
+            if len(ok) > 2:
+                curve = without_polynomial(x, x**2 / 2, 2)
+            else:
+                curve = np.zeros(1)
             size = float(np.linalg.norm(curve))
-            error[i, c] = scale / size if size > 0 else np.inf
+            if size > 0:
+                error[i, c] = scale / size
+            else:
+                error[i, c] = np.inf
             if size > 0:
                 excess[i, c] = scale * float(curve @ rest[ok, c]) / size**2
     return excess, error
@@ -139,8 +162,11 @@ def chi_squared(frames: Frames, acceleration: np.ndarray, some: np.ndarray) -> f
     return total
 
 
-def _of_one_parabola(frames: Frames, acceleration: np.ndarray, some: np.ndarray) -> float:
-    """chi^2 of frames on one free parabola in each coordinate; inf if it curves like a flight.
+def _of_one_parabola(
+    frames: Frames, acceleration: np.ndarray, some: np.ndarray
+) -> float:
+    """chi^2 of frames on one free parabola in each coordinate; inf if it curves like a
+    flight.
 
     That is: its acceleration is nearer to the known one than to 0.
     """

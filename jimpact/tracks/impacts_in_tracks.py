@@ -43,47 +43,55 @@ def find_impacts(
     quaternion: str | None = None,
     inertia: Any = None,
 ) -> Track:
-    """The impacts of a track: instants, velocities before and after, and their covariance.
+    """The impacts of a track: instants, velocities before and after, and their
+    covariance.
 
-    Equation: between impacts `q = P + v (t - tau) + a (t - tau)^2 / 2`; the arcs on both sides of
-    an impact meet at its instant tau. Places P, velocities and instants of all impacts are most
-    likely at once for normal errors, of standard error sigma and, where residuals show them, with
-    waves that neighbouring frames share; flights that bend have accelerations of their own. There
-    are as many impacts as there is evidence for beside these. Nothing is smoothed or
-    differentiated. Where a contact lasts, the arcs meet at the centroid of the pulse of its force.
+    Equation: between impacts `q = P + v (t - tau) + a (t - tau)^2 / 2`; the arcs on
+    both sides of an impact meet at its instant tau. Places P, velocities and instants
+    of all impacts are most likely at once for normal errors, of standard error sigma
+    and, where residuals show them, with waves that neighbouring frames share; flights
+    that bend have accelerations of their own. There are as many impacts as there is
+    evidence for beside these. Nothing is smoothed or differentiated. Where a contact
+    lasts, the arcs meet at the centroid of the pulse of its force.
 
     Args:
         t: times of the frames, rising (T,) [s].
-        q: coordinates (T,) or (T, n) [m] or [rad]; NaN where the body was lost. An angle goes on
-            beyond pi, or is unwrapped where `units` say 'rad'. The velocities are the rates of q.
-        sigma: standard errors of q, a number or (n,), > 0; None: estimated from the residuals.
-            Residuals that are clearly larger than a given sigma take its place, and are told.
-        acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height; None: one
-            unknown in each coordinate, common to all flights, or an entry of a list, `[0, None]`;
-            or a function of velocities (.., n) [m/s] that returns accelerations, as of spin.
-        drag: k >= 0 of the air's `-k |v| v`, |v| that of the places [1/m]; .12 of a table-tennis
-            ball; None: one unknown for all flights. Between impacts the arcs bend accordingly.
+        q: coordinates (T,) or (T, n) [m] or [rad]; NaN where the body was lost. An
+            angle goes on beyond pi, or is unwrapped where `units` say 'rad'. The
+            velocities are the rates of q.
+        sigma: standard errors of q, a number or (n,), > 0; None: estimated from the
+            residuals. Residuals that are clearly larger than a given sigma take its
+            place, and are told.
+        acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height;
+            None: one unknown in each coordinate, common to all flights, or an entry of
+            a list, `[0, None]`; or a function of velocities (.., n) [m/s] that returns
+            accelerations, as of spin.
+        drag: k >= 0 of the air's `-k |v| v`, |v| that of the places [1/m]; .12 of a
+            table-tennis ball; None: one unknown for all flights. Between impacts the
+            arcs bend accordingly.
         contact: the longest duration of a contact, whose frames are left out, >= 0 [s].
         shortest: frames of a flight, >= 3.
-        window: of each flight use only so long before and after an impact, > 0 [s], where flights
-            are not quite ballistic; None: whole flights.
+        window: of each flight use only so long before and after an impact, > 0 [s],
+            where flights are not quite ballistic; None: whole flights.
         units: of each coordinate, 'm' or 'rad', or one for all; None: m.
-        quaternion: 'wxyz' or 'xyzw', the order in which poses hold it; then q is (T, 7), the centre
-            of mass and a unit quaternion of either sign, from the axes of the body to those of
-            space. sigma has (6,), places and turns about the axes of the body [rad], acceleration
-            (3,). Impacts are found by the places.
-        inertia: of a body with poses, (3,) along its axes or (3, 3), about the centre of mass, up
-            to a factor: between impacts it turns freely. None: as a sphere or a cube does.
+        quaternion: 'wxyz' or 'xyzw', the order in which poses hold it; then q is (T,
+            7), the centre of mass and a unit quaternion of either sign, from the axes
+            of the body to those of space. sigma has (6,), places and turns about the
+            axes of the body [rad], acceleration (3,). Impacts are found by the places.
+        inertia: of a body with poses, (3,) along its axes or (3, 3), about the centre
+            of mass, up to a factor: between impacts it turns freely. None: as a sphere
+            or a cube does.
 
     Returns:
-        `Track`, which prints and plots; `warnings` say which flights are not ballistic, which
-        impacts are doubtful, and that no impact was found; `candidates` how many went, and why.
-        With `quaternion` velocities are (x', omega), omega in the axes of the body, as of `ji.Box`,
-        and poses hold the quaternion's scalar first.
+        `Track`, which prints and plots; `warnings` say which flights are not ballistic,
+        which impacts are doubtful, and that no impact was found; `candidates` how many
+        went, and why. With `quaternion` velocities are (x', omega), omega in the axes
+        of the body, as of `ji.Box`, and poses hold the quaternion's scalar first.
 
     Raises:
-        ValueError: fewer frames than a flight and a half, times that do not rise or are not finite,
-            sigma <= 0, other shapes; no flight at all; a quaternion whose length is not 1.
+        ValueError: fewer frames than a flight and a half, times that do not rise or are
+            not finite, sigma <= 0, other shapes; no flight at all; a quaternion whose
+            length is not 1.
 
     >>> import numpy as np
     >>> import jimpact as ji
@@ -108,7 +116,10 @@ def find_impacts(
     raw = q
     q = _unwrapped(q, names)
     rough = noise(q)
-    given = rough if sigma is None else _of_coordinates("sigma", sigma, n)
+    if sigma is None:
+        given = rough
+    else:
+        given = _of_coordinates("sigma", sigma, n)
     check_values("sigma", given, low=0.0, open_low=True)
     check_values("contact", np.asarray(contact, float), low=0.0)
     if window is not None:
@@ -119,7 +130,9 @@ def find_impacts(
     settings = Settings(sigma is None, contact, shortest, window)
     notes = [*findings_of_input(raw, given, names), *findings_of_bodies(raw)]
     if not flight.unknown.any():
-        notes += findings_of_signs(flight.straight(frames), flight.acceleration, shortest)
+        notes += findings_of_signs(
+            flight.straight(frames), flight.acceleration, shortest
+        )
     search = searched(frames, flight, settings)
     whole, flights = fitted_arcs(search)
     arcs = whole
@@ -128,7 +141,10 @@ def find_impacts(
     if acceleration_is_known(flight):
         notes += findings_of_held(t, search.verdict.flights, search.candidates)
     doubtful = doubts(search, arcs)
-    notes += [*findings(search, arcs, whole.members, rough), *findings_of_doubts(doubtful)]
+    notes += [
+        *findings(search, arcs, whole.members, rough),
+        *findings_of_doubts(doubtful),
+    ]
     candidates = notes_of(search, len(search.verdict.flights) - len(flights))
     track = _as_track(t, _unwrapped(raw, names), arcs, names, doubtful)
     return replace(track, warnings=tuple(notes), candidates=tuple(candidates))
@@ -161,7 +177,8 @@ def _model(acceleration: Any, drag: float | None, units: tuple[str, ...]) -> Fli
         check_values("drag", np.asarray(drag, float), low=0.0)
     if (drag != 0 or force is not None) and "rad" in units:
         raise ValueError(
-            "Argument `drag` must be 0, and `acceleration` no function, where q holds angles, as "
+            "Argument `drag` must be 0, and `acceleration` no function, where q holds "
+            "angles, as "
             f"they are of places, but `drag` has value {drag}."
         )
     return Flight(known, unknown, drag or 0.0, drag is None, force)
@@ -172,8 +189,10 @@ def _checked_force(function: Any, n: int) -> Force:
     found = np.asarray(function(np.zeros((2, n))), float)
     if found.shape != (2, n) or not np.isfinite(found).all():
         raise ValueError(
-            f"Argument `acceleration`, a function of velocities (..., {n}), must return finite "
-            f"accelerations of the same shape, but of zeros ({2}, {n}) returns {found.tolist()}."
+            f"Argument `acceleration`, a function of velocities (..., {n}), must "
+            f"return finite "
+            f"accelerations of the same shape, but of zeros ({2}, {n}) returns "
+            f"{found.tolist()}."
         )
     return lambda v: np.asarray(function(v), float)
 
@@ -187,53 +206,75 @@ def _in_poses(
     inertia: Any,
     options: dict[str, Any],
 ) -> Track:
-    """Track of poses (T, 7): impacts by the places, then angular velocities by the quaternions.
+    """Track of poses (T, 7): impacts by the places, then angular velocities by the
+    quaternions.
 
     `options`: all other arguments of `find_impacts`.
     """
     if quaternion is None:
-        raise ValueError("Argument `inertia` is for poses, whose order `quaternion` must name.")
+        raise ValueError(
+            "Argument `inertia` is for poses, whose order `quaternion` must name."
+        )
     if options["units"] is not None:
-        raise ValueError("Argument `units` is not for poses: places [m] and a quaternion.")
+        raise ValueError(
+            "Argument `units` is not for poses: places [m] and a quaternion."
+        )
     for name, value in (("t", t), ("q", q)):
         check_concrete(name, value)
         as_float_array(name, value)  # raises for what are no numbers
     places, e = as_poses(q, quaternion)
     moments = as_inertia(inertia)
-    of_places, of_turns = None, None
+    of_places = None
+    of_turns = None
     if sigma is not None:
         both = _of_coordinates("sigma", sigma, 6)
         check_values("sigma", both, low=0.0, open_low=True)
-        of_places, of_turns = both[:3], both[3:]
+        of_places = both[:3]
+        of_turns = both[3:]
     track = find_impacts(t, places, of_places, acceleration=acceleration, **options)
-    return replace(with_turns(track, e, of_turns, moments), order=quaternion, inertia=moments)
+    return replace(
+        with_turns(track, e, of_turns, moments), order=quaternion, inertia=moments
+    )
 
 
-def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+def _checked(
+    t: Any, q: Any, shortest: int, units: Any
+) -> tuple[np.ndarray, np.ndarray, Any]:
     """Checked times (T,) [s], coordinates (T, n) and their units (n,), 'm' or 'rad'."""
     for name, value in (("t", t), ("q", q)):
         check_concrete(name, value)
         as_float_array(name, value)  # raises for what are no numbers
-    t, q = np.asarray(t, float), np.array(q, float)
-    q = q[:, None] if q.ndim == 1 else q
+    t = np.asarray(t, float)
+    q = np.array(q, float)
+    if q.ndim == 1:
+        q = q[:, None]
     if t.ndim != 1 or q.ndim != 2 or len(t) != len(q) or q.shape[1] == 0:
         raise ValueError(
-            f"Arguments `t` and `q` must have shapes (T,) and (T,) or (T, n), but have {t.shape} "
+            f"Arguments `t` and `q` must have shapes (T,) and (T,) or (T, n), but have "
+            f"{t.shape} "
             f"and {q.shape}."
         )
-    if isinstance(shortest, bool) or not isinstance(shortest, int | np.integer) or shortest < 3:
-        raise ValueError(f"Argument `shortest` must be a whole number >= 3, but is {shortest!r}.")
+    if (
+        isinstance(shortest, bool)
+        or not isinstance(shortest, int | np.integer)
+        or shortest < 3
+    ):
+        raise ValueError(
+            f"Argument `shortest` must be a whole number >= 3, but is {shortest!r}."
+        )
     check_values("t", t)
     check_values("q", q, nan_allowed=True)
     if len(t) < shortest:
         raise ValueError(
-            f"Argument `t` must have {shortest} frames or more, those of a flight (`shortest`), "
+            f"Argument `t` must have {shortest} frames or more, those of a flight "
+            f"(`shortest`), "
             f"but has {len(t)}."
         )
     if not (np.diff(t) > 0).all():
         k = int(np.argmin(np.diff(t) > 0))
         raise ValueError(
-            f"Argument `t` must rise, but frame {k + 2} is at {t[k + 1]:g} s, after {t[k]:g} s."
+            f"Argument `t` must rise, but frame {k + 2} is at {t[k + 1]:g} s, after "
+            f"{t[k]:g} s."
         )
     lost = ~np.isfinite(q).any(axis=0)
     if lost.any():
@@ -243,25 +284,36 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
         )
     seen = int(np.isfinite(q).all(axis=1).sum())
     if np.isfinite(q).any(axis=1).sum() < shortest:
-        raise ValueError(f"Argument `q` was seen in {seen} frames: {shortest} make a flight.")
+        raise ValueError(
+            f"Argument `q` was seen in {seen} frames: {shortest} make a flight."
+        )
     n = q.shape[1]
-    names = ("m",) * n if units is None else (units,) * n if isinstance(units, str) else units
+    if units is None:
+        names = ("m",) * n
+    elif isinstance(units, str):
+        names = (units,) * n
+    else:
+        names = units
     if len(names) != n or not set(names) <= set(VELOCITY_OF):
         raise ValueError(
-            f"Argument `units` must have {n} entries, each 'm' or 'rad', but has value {units!r}: "
+            f"Argument `units` must have {n} entries, each 'm' or 'rad', but has value "
+            f"{units!r}: "
             "convert lengths and angles to these."
         )
     return t, q, tuple(names)
 
 
 def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
-    """Argument `name`, a number for all coordinates or one for each, checked, as (n,)."""
+    """Argument `name`, a number for all coordinates or one for each, checked, as
+    (n,).
+    """
     check_concrete(name, value)
     as_float_array(name, value)  # raises for what are no numbers
     array = np.asarray(value, float)
     if array.shape not in ((), (n,)):
         raise ValueError(
-            f"Argument `{name}` must be a number or have shape ({n},), one for each coordinate, "
+            f"Argument `{name}` must be a number or have shape ({n},), one for each "
+            f"coordinate, "
             f"but has shape {array.shape}."
         )
     check_values(name, array)
@@ -269,7 +321,9 @@ def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
 
 
 def _unwrapped(q: np.ndarray, units: tuple[str, ...]) -> np.ndarray:
-    """Coordinates (T, n) in which angles, in frames that were seen, have no steps of 2 pi."""
+    """Coordinates (T, n) in which angles, in frames that were seen, have no steps of 2
+    pi.
+    """
     q = q.copy()
     for c in np.flatnonzero(np.array(units) == "rad"):
         seen = np.isfinite(q[:, c])
@@ -293,7 +347,13 @@ def _as_track(
     places = arcs.places[1:-1]
     impacts = tuple(
         TrackImpact(
-            float(times[k]), float(errors[k]), places[k], pre[k], post[k], blocks[k], bool(doubt)
+            float(times[k]),
+            float(errors[k]),
+            places[k],
+            pre[k],
+            post[k],
+            blocks[k],
+            bool(doubt),
         )
         for k, doubt in enumerate(doubtful)
     )

@@ -12,55 +12,69 @@ from jimpact.tracks.frames import Frames, differences, median
 from jimpact.tracks.held import excess_of
 from jimpact.tracks.search import Search, curvature
 
-# Chance that a good track has a warning: half by curvatures, half by sizes of residuals. Ten times
-# more would warn of one good track in ten.
+# Chance that a good track has a warning: half by curvatures, half by sizes of
+# residuals. Ten times more would warn of one good track in ten.
 FALSE_ALARMS = 0.01
-# Share of the frames, lost ones aside, that fit no flight, from which on it is said. Good frames
-# are left out once in 1000.
+# Share of the frames, lost ones aside, that fit no flight, from which on it is said.
+# Good frames are left out once in 1000.
 UNUSED = 0.03
 # Frames in a row that fit no flight at an end of the track, from which on it is said.
 AT_AN_END = 2
-# Share of the moving frames that repeat the one before to the last digit; noise does it hardly
-# ever, but for positions in whole pixels.
+# Share of the moving frames that repeat the one before to the last digit; noise does it
+# hardly ever, but for positions in whole pixels.
 DOUBLED = 0.05
-# Error of an angle [rad], 6 degrees, from which on degrees are suspected: trackers have a tenth of
-# it and less. Ten times more is half a turn; ten times less would warn of many good tracks.
+# Error of an angle [rad], 6 degrees, from which on degrees are suspected: trackers have
+# a tenth of it and less. Ten times more is half a turn; ten times less would warn of
+# many good tracks.
 COARSE_ANGLE = 0.1
-# Residuals in units of the noise from frame to frame from which on flights do not explain them.
-# White noise stays below 1.3; ten times more would pass impacts that were not found.
+# Residuals in units of the noise from frame to frame from which on flights do not
+# explain them. White noise stays below 1.3; ten times more would pass impacts that were
+# not found.
 UNEXPLAINED = 3.0
-# Frames from the first one on in which signs of accelerations are looked at. Ten times more takes
-# ten times as long.
+# Frames from the first one on in which signs of accelerations are looked at. Ten times
+# more takes ten times as long.
 LOOKED_AT = 400
-# Bodies whose rows may alternate in a table, and how much larger the noise from row to row is then
-# than that of one body. Ten times more would pass bodies that are near one another.
+# Bodies whose rows may alternate in a table, and how much larger the noise from row to
+# row is then than that of one body. Ten times more would pass bodies that are near one
+# another.
 MOST_BODIES = 6
 ALTERNATING = 10.0
-# Share of residuals in a flight beyond sigma where times are a likely cause: they grow with speed.
+# Share of residuals in a flight beyond sigma where times are a likely cause: they grow
+# with speed.
 WITH_SPEED = 2.0
 
 
-def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) -> list[str]:
-    """Findings in the frames q (T, n) alone: repeated ones, angles that are perhaps in degrees.
+def findings_of_input(
+    q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]
+) -> list[str]:
+    """Findings in the frames q (T, n) alone: repeated ones, angles that are perhaps in
+    degrees.
 
     Steps of angles between frames seen in a row must stay below a quarter of a turn.
     """
-    found, seen = [], np.isfinite(q).all(axis=1)
+    found = []
+    seen = np.isfinite(q).all(axis=1)
     places = q[seen]
     if len(places) > 2:
         same = (np.diff(places, axis=0) == 0).all(axis=1)
         if DOUBLED <= same.mean() < 1:
             found.append(
-                f"{int(same.sum())} of {len(places)} frames repeat the one before to the last "
-                "digit: a film converted to another rate has frames twice, and its times are wrong."
+                f"{int(same.sum())} of {len(places)} frames repeat the one before to "
+                f"the last "
+                "digit: a film converted to another rate has frames twice, and its "
+                "times are wrong."
             )
     for c in np.flatnonzero(np.array(units) == "rad"):
-        steps = np.abs(np.diff(places[:, c])) if len(places) > 1 else np.zeros(1)
+        if len(places) > 1:
+            steps = np.abs(np.diff(places[:, c]))
+        else:
+            steps = np.zeros(1)
         # turns of 2 pi are unwrapped; what is left tells how far a frame turns
         turned = np.abs((steps + np.pi) % (2 * np.pi) - np.pi)
         if (steps > 3 * np.pi).any() or np.quantile(turned, 0.9) > np.pi / 2:
             found.append(
-                f"Coordinate {c + 1} turns by more than a quarter of a turn from frame to frame: "
+                f"Coordinate {c + 1} turns by more than a quarter of a turn from frame "
+                f"to frame: "
                 "is it in degrees, or do the frames miss turns?"
             )
         elif sigma[c] > COARSE_ANGLE:
@@ -72,24 +86,31 @@ def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) 
 
 
 def findings_of_turns(
-    e: np.ndarray, sigma: np.ndarray, residual: np.ndarray, p_values: np.ndarray, taken: float
+    e: np.ndarray,
+    sigma: np.ndarray,
+    residual: np.ndarray,
+    p_values: np.ndarray,
+    taken: float,
 ) -> list[str]:
     """Findings in the orientations of poses, quaternions e (T, 4).
 
-    Turns between frames above a quarter; a large sigma (3,) [rad]; chi^2 of `residual` (T, 3), in
-    units of sigma, above what the frames less `taken` fitted values allow; `p_values` (K,) of
-    orientations that meet at impacts.
+    Turns between frames above a quarter; a large sigma (3,) [rad]; chi^2 of `residual`
+    (T, 3), in units of sigma, above what the frames less `taken` fitted values allow;
+    `p_values` (K,) of orientations that meet at impacts.
     """
-    found, seen = [], e[np.isfinite(e).all(axis=1)]
+    found = []
+    seen = e[np.isfinite(e).all(axis=1)]
     cosines = np.minimum(np.abs((seen[1:] * seen[:-1]).sum(axis=1)), 1.0)
     if len(cosines) and np.quantile(2 * np.arccos(cosines), 0.9) > np.pi / 2:
         found.append(
-            "The body turns by more than a quarter of a turn from frame to frame: do the frames "
+            "The body turns by more than a quarter of a turn from frame to frame: do "
+            "the frames "
             "miss turns?"
         )
     if (sigma > COARSE_ANGLE).any():
         found.append(
-            f"The orientations have a standard error of {sigma.max():.2g} rad: is `sigma` in "
+            f"The orientations have a standard error of {sigma.max():.2g} rad: is "
+            f"`sigma` in "
             "degrees, or does the body not turn freely between impacts (`inertia`)?"
         )
     freedom = max(np.isfinite(residual).sum() - taken, 1.0)
@@ -97,24 +118,29 @@ def findings_of_turns(
     if chi2.sf(square, freedom) < FALSE_ALARMS / 4:
         found.append(
             f"The body does not turn freely within sigma: residuals are "
-            f"{np.sqrt(square / freedom):.2g} times as large. Perhaps `inertia` is another, an "
+            f"{np.sqrt(square / freedom):.2g} times as large. Perhaps `inertia` is "
+            f"another, an "
             "impact was not found, or the orientations were smoothed."
         )
     apart = np.flatnonzero(p_values < FALSE_ALARMS / 4 / max(len(p_values), 1))
     if apart.size:
         numbers = ", ".join(str(k + 1) for k in apart)
         found.append(
-            f"The turns before and after impact {numbers} do not meet at the instant of the places:"
+            f"The turns before and after impact {numbers} do not meet at the instant "
+            f"of the places:"
             " are there two impacts in one, or were orientations smoothed across it?"
         )
     return found
 
 
-def findings_of_signs(frames: Frames, acceleration: np.ndarray, shortest: int) -> list[str]:
-    """Findings of coordinates that curve against their known acceleration, as y of pixels does.
+def findings_of_signs(
+    frames: Frames, acceleration: np.ndarray, shortest: int
+) -> list[str]:
+    """Findings of coordinates that curve against their known acceleration, as y of
+    pixels does.
 
-    Where the second differences have the other sign: if flights of the first LOOKED_AT frames cost
-    less (chi^2 and prices) with the sign of this acceleration changed.
+    Where the second differences have the other sign: if flights of the first LOOKED_AT
+    frames cost less (chi^2 and prices) with the sign of this acceleration changed.
     """
     some = slice(0, LOOKED_AT)
     frames = Frames(frames.t[some], frames.q[some], frames.sigma)
@@ -130,27 +156,34 @@ def findings_of_signs(frames: Frames, acceleration: np.ndarray, shortest: int) -
         if mirrored < stated:
             found.append(
                 f"Coordinate {c + 1} curves the other way than an acceleration of "
-                f"{acceleration[c]:.4g}: does it point down, as y of pixels? Then take -q of it."
+                f"{acceleration[c]:.4g}: does it point down, as y of pixels? Then take "
+                f"-q of it."
             )
     return found
 
 
-def findings_of_noise(differences: np.ndarray, residuals: np.ndarray, first: int = 1) -> list[str]:
-    """Findings of coordinates whose residuals exceed UNEXPLAINED times the noise `differences`.
+def findings_of_noise(
+    differences: np.ndarray, residuals: np.ndarray, first: int = 1
+) -> list[str]:
+    """Findings of coordinates whose residuals exceed UNEXPLAINED times the noise
+    `differences`.
 
     Both (n,) are standard errors; coordinates are numbered from `first`.
     """
     return [
         f"Coordinate {c + first} has residuals of {residuals[c]:.2g}, but noise of "
-        f"{differences[c]:.2g} from frame to frame: is an impact missing, or do the flights bend?"
+        f"{differences[c]:.2g} from frame to frame: is an impact missing, or do the "
+        f"flights bend?"
         for c in np.flatnonzero(residuals > UNEXPLAINED * differences)
     ]
 
 
 def findings_of_bodies(q: np.ndarray) -> list[str]:
-    """Findings of places q (T, n) that alternate: rows of several bodies, as in a long table.
+    """Findings of places q (T, n) that alternate: rows of several bodies, as in a long
+    table.
 
-    Third differences of every second, third, .. row are then far smaller than those of all.
+    Third differences of every second, third, .. row are then far smaller than those of
+    all.
     """
     whole = np.array([median(np.abs(differences(x, 3))) for x in q.T])
     for bodies in range(2, MOST_BODIES + 1):
@@ -159,8 +192,10 @@ def findings_of_bodies(q: np.ndarray) -> list[str]:
         own = np.array([median(np.abs(differences(x, 3, bodies))) for x in q.T])
         if (own * ALTERNATING < whole).any():
             return [
-                f"Places alternate between {bodies} bodies from row to row: this is a long table, "
-                "not one track. Read one body, `ji.tracks.read(.., where={'body': 'A'})`."
+                f"Places alternate between {bodies} bodies from row to row: this is a "
+                f"long table, "
+                "not one track. Read one body, `ji.tracks.read(.., where={'body': "
+                "'A'})`."
             ]
     return []
 
@@ -168,46 +203,62 @@ def findings_of_bodies(q: np.ndarray) -> list[str]:
 def findings(
     search: Search, arcs: Arcs, used: Sequence[np.ndarray], noise: np.ndarray
 ) -> list[str]:
-    """Findings in a fitted track: curvatures, waves, large residuals, unused frames, no impact.
+    """Findings in a fitted track: curvatures, waves, large residuals, unused frames, no
+    impact.
 
     `used`: frames of flights before a window; `noise` (n,): from frame to frame.
     """
     frames = search.frames
     unused = _unused(frames, used, search.settings.shortest)
-    found = [*_of_curvatures(frames.t, arcs), *_of_waves(arcs), *_of_sizes(arcs), *unused]
+    found = [
+        *_of_curvatures(frames.t, arcs),
+        *_of_waves(arcs),
+        *_of_sizes(arcs),
+        *unused,
+    ]
     if search.settings.estimated and not arcs.flight.bends:
         found += findings_of_noise(noise, arcs.errors.sigma)
     if not search.settings.estimated:
         found += _of_a_given_sigma(frames.sigma, arcs.errors.sigma)
     if not arcs.impacts:
-        rest = "" if unused else ": one flight explains all frames within sigma"
+        if unused:
+            rest = ""
+        else:
+            rest = ": one flight explains all frames within sigma"
         found.insert(0, f"No impact was found{rest}.")
     return found
 
 
 def _of_a_given_sigma(given: np.ndarray, found: np.ndarray) -> list[str]:
-    """Findings of coordinates whose residuals took the place of the given sigma (n,)."""
+    """Findings of coordinates whose residuals took the place of the given sigma
+    (n,).
+    """
     return [
         f"Coordinate {c + 1} is not ballistic within sigma: its residuals are "
-        f"{found[c] / given[c]:.2g} times as large, and the errors follow them. Perhaps times "
+        f"{found[c] / given[c]:.2g} times as large, and the errors follow them. "
+        f"Perhaps times "
         "jitter, frames are there twice, or a false point was tracked."
         for c in np.flatnonzero(found > given)
     ]
 
 
 def notes_of(search: Search, joined: int) -> list[str]:
-    """What became of candidates, in lines; `joined`: those with jumps below five errors."""
+    """What became of candidates, in lines; `joined`: those with jumps below five
+    errors.
+    """
     verdict = search.verdict
     found = []
     within = verdict.within_errors + joined
     if within:
         found.append(
-            f"{counted(within, 'candidate')} for an impact went: flights make such jumps without "
+            f"{counted(within, 'candidate')} for an impact went: flights make such "
+            f"jumps without "
             "one, by the size and the waves of their residuals"
         )
     if verdict.bends:
         found.append(
-            f"{counted(verdict.bends, 'candidate')} for an impact went: a flight of another "
+            f"{counted(verdict.bends, 'candidate')} for an impact went: a flight of "
+            f"another "
             "acceleration explains the frames better"
         )
     return found
@@ -219,8 +270,10 @@ def findings_of_doubts(doubts: np.ndarray) -> list[str]:
         return []
     numbers = listed([str(k + 1) for k in np.flatnonzero(doubts)])
     return [
-        f"Impact {numbers} may be none: a flight of another acceleration explains its frames as "
-        "well. Perhaps drag, a rolling shutter, or the acceleration is wrong. `experiments` leaves "
+        f"Impact {numbers} may be none: a flight of another acceleration explains its "
+        f"frames as "
+        "well. Perhaps drag, a rolling shutter, or the acceleration is wrong. "
+        "`experiments` leaves "
         "it out unless `doubtful=True`."
     ]
 
@@ -228,12 +281,14 @@ def findings_of_doubts(doubts: np.ndarray) -> list[str]:
 def findings_of_held(
     t: np.ndarray, flights: Sequence[np.ndarray], candidates: Sequence[np.ndarray]
 ) -> list[str]:
-    """Findings of frames before the first and after the last free flight, which are left out.
+    """Findings of frames before the first and after the last free flight, which are
+    left out.
 
     `candidates`: flights before those in which the body is held were left out.
     """
     why = (
-        "there are no flights of this acceleration. Perhaps the body rests, slides, rolls or is "
+        "there are no flights of this acceleration. Perhaps the body rests, slides, "
+        "rolls or is "
         "held, it bounces faster than frames show, or the acceleration is wrong."
     )
     found = []
@@ -247,11 +302,12 @@ def findings_of_held(
 
 
 def _of_curvatures(t: np.ndarray, arcs: Arcs) -> list[str]:
-    """Findings of flights with an acceleration beyond that of the fit, by its standard error.
+    """Findings of flights with an acceleration beyond that of the fit, by its standard
+    error.
 
-    The limit keeps false alarms over all flights and coordinates below a quarter of FALSE_ALARMS
-    on each side. Coordinates with waves are left out; flights that have an acceleration of their
-    own are told.
+    The limit keeps false alarms over all flights and coordinates below a quarter of
+    FALSE_ALARMS on each side. Coordinates with waves are left out; flights that have an
+    acceleration of their own are told.
     """
     n = len(arcs.errors.sigma)
     excess, error = excess_of(t, arcs.residual, arcs.errors.sigma, arcs.members)
@@ -266,15 +322,25 @@ def _of_curvatures(t: np.ndarray, arcs: Arcs) -> list[str]:
     found = []
     for i, c in zip(*np.nonzero(far)):
         same = far[:, c].sum() > 1 and len(set(np.sign(excess[far[:, c], c]))) == 1
-        why = (
-            "the acceleration, the scale of lengths or of times, or a rolling shutter"
-            if same
-            else "drag, spin, a rolling shutter, a moving camera, or an impact that was not found"
-        )
-        taken = " It is taken as its own." if arcs.bent[i, c] else ""
+        if same:
+            why = (
+                "the acceleration, the scale of lengths or of times, or a rolling "
+                "shutter"
+            )
+        else:
+            why = (
+                "drag, spin, a rolling shutter, a moving camera, or an impact that "
+                "was not found"
+            )
+        if arcs.bent[i, c]:
+            taken = " It is taken as its own."
+        else:
+            taken = ""
         found.append(
-            f"Flight {i + 1} is not ballistic: coordinate {c + 1} has an acceleration of "
-            f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps {why}.{taken}"
+            f"Flight {i + 1} is not ballistic: coordinate {c + 1} has an acceleration "
+            f"of "
+            f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps "
+            f"{why}.{taken}"
         )
     return found
 
@@ -284,16 +350,20 @@ def _of_waves(arcs: Arcs) -> list[str]:
     errors = arcs.errors
     return [
         f"Flights wave in coordinate {c + 1}, by {errors.waves[c]:.2g} over "
-        f"{errors.times[c]:.2g} s beside noise of {errors.sigma[c]:.2g}: perhaps a table that is "
-        "not level, a lens, drag, spin, a moving camera or times that err. The errors hold this."
+        f"{errors.times[c]:.2g} s beside noise of {errors.sigma[c]:.2g}: perhaps a "
+        f"table that is "
+        "not level, a lens, drag, spin, a moving camera or times that err. The errors "
+        "hold this."
         for c in np.flatnonzero(errors.waves)
     ]
 
 
 def _of_sizes(arcs: Arcs) -> list[str]:
-    """Findings of flights whose chi^2 has a p-value below FALSE_ALARMS / 2 / (their number).
+    """Findings of flights whose chi^2 has a p-value below FALSE_ALARMS / 2 / (their
+    number).
 
-    Of coordinates without waves. Where residuals grow with speed, or rates vary, times are named.
+    Of coordinates without waves. Where residuals grow with speed, or rates vary, times
+    are named.
     """
     flights = len(arcs.members)
     plain = arcs.errors.waves == 0
@@ -309,7 +379,8 @@ def _of_sizes(arcs: Arcs) -> list[str]:
             found.append(
                 f"Flight {i + 1} is not ballistic within sigma: its residuals are "
                 f"{np.sqrt(np.nansum(rest**2) / freedom):.2g} times as large (p-value "
-                f"{p_value:.1g}). Perhaps times jitter, frames are there twice, or a false point "
+                f"{p_value:.1g}). Perhaps times jitter, frames are there twice, or a "
+                f"false point "
                 "was tracked."
             )
     return found + _of_times(arcs)
@@ -318,7 +389,8 @@ def _of_sizes(arcs: Arcs) -> list[str]:
 def _of_times(arcs: Arcs) -> list[str]:
     """Finding of residuals that grow with the speed, as those by errors of times do.
 
-    Equation: of a line `r^2 = s^2 + d^2 v^2` by least squares over all frames and coordinates,
+    Equation: of a line `r^2 = s^2 + d^2 v^2` by least squares over all frames and
+    coordinates,
     d > 0 by four of its errors, and d v above the noise.
     """
     squares = []
@@ -335,13 +407,16 @@ def _of_times(arcs: Arcs) -> list[str]:
         return []
     terms = np.column_stack([np.ones(ok.sum()), x[ok] / x[ok].max()])
     found = np.linalg.lstsq(terms, y[ok], rcond=None)[0]
-    error = np.sqrt(np.linalg.inv(terms.T @ terms)[-1, -1]) * np.std(y[ok] - terms @ found)
+    error = np.sqrt(np.linalg.inv(terms.T @ terms)[-1, -1]) * np.std(
+        y[ok] - terms @ found
+    )
     grown = float(found[-1])
     if grown < 4 * error or grown < WITH_SPEED**2 * max(float(found[0]), 0.0):
         return []
     seconds = np.sqrt(grown / x[ok].max())
     return [
-        f"Residuals grow with the speed, as if times of frames erred by {seconds:.2g} s: does the "
+        f"Residuals grow with the speed, as if times of frames erred by {seconds:.2g} "
+        f"s: does the "
         "rate vary (phones), are pictures repeated, or is the clock that of a computer?"
     ]
 
@@ -357,19 +432,22 @@ def _unused(frames: Frames, members: Sequence[np.ndarray], shortest: int) -> lis
         count = int(rows.sum())
         if count >= shortest:
             found.append(
-                f"The {where} {len(rows)} frames fit no flight: their acceleration is another, or "
+                f"The {where} {len(rows)} frames fit no flight: their acceleration is "
+                f"another, or "
                 "their errors are larger. An impact there is not found."
             )
         elif count >= AT_AN_END:
             found.append(
-                f"The {where} {len(rows)} frames are too few for a flight, and fit no other: an "
+                f"The {where} {len(rows)} frames are too few for a flight, and fit no "
+                f"other: an "
                 "impact there is not found."
             )
     inner = slice(order[0], order[-1] + 1)
     lost = int((seen[inner] & ~used[inner]).sum())
     if lost > UNUSED * seen[inner].sum() + 1:
         found.append(
-            f"{lost} of {int(seen[inner].sum())} frames are left out: they fit no flight, or lie "
+            f"{lost} of {int(seen[inner].sum())} frames are left out: they fit no "
+            f"flight, or lie "
             "in a contact."
         )
     return found

@@ -1,7 +1,8 @@
 """Tables of motion capture: one name for three columns, units and rates in the head.
 
-Qualisys TSV, TRC, the CSV files of OptiTrack Motive and of Vicon Nexus, and C3D. Axes are as in the
-file: x, y, z, and qx .. qw of rigid bodies. A marker that was lost is NaN, by each format's mark.
+Qualisys TSV, TRC, the CSV files of OptiTrack Motive and of Vicon Nexus, and C3D. Axes
+are as in the file: x, y, z, and qx .. qw of rigid bodies. A marker that was lost is
+NaN, by each format's mark.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,24 +15,38 @@ from jimpact.tools.checks import needed, suggestion
 
 PLACE = ("x", "y", "z")
 TURN = ("qx", "qy", "qz", "qw")
-# Share of a step between frames to which times must agree with a rate that a file states beside
-# them, beyond the rounding of their last digit. Ten times more would pass 59.94 for 60 frames a
-# second, which is an error of .1 %.
+# Share of a step between frames to which times must agree with a rate that a file
+# states beside them, beyond the rounding of their last digit. Ten times more would pass
+# 59.94 for 60 frames a second, which is an error of .1 %.
 RATE_WITHIN = 5e-4
-# Share of a step that the last digit of times may be; where it is more, equally spaced frames have
-# the times of their numbers.
+# Share of a step that the last digit of times may be; where it is more, equally spaced
+# frames have the times of their numbers.
 DIGIT_WITHIN = 1e-3
-AT_AN_END = 2  # frames of exactly 0, 0, 0 in a row from which on a marker was lost there
-LENGTHS = {"meters": "m", "metres": "m", "millimeters": "mm", "centimeters": "cm", "m": "m"}
-LENGTHS |= {"millimetres": "mm", "centimetres": "cm", "mm": "mm", "cm": "cm", "meter": "m"}
+# frames of exactly 0, 0, 0 in a row from which on a marker was lost there
+AT_AN_END = 2
+LENGTHS = {
+    "meters": "m",
+    "metres": "m",
+    "millimeters": "mm",
+    "centimeters": "cm",
+    "m": "m",
+}
+LENGTHS |= {
+    "millimetres": "mm",
+    "centimetres": "cm",
+    "mm": "mm",
+    "cm": "cm",
+    "meter": "m",
+}
 
 
 @dataclass(frozen=True)
 class Capture:
     """A table of motion capture.
 
-    Fields: format; axes and places (T, k) of each marker; unit of lengths and rate [frames a
-    second] that the file states, None where it does not; times t (T,) [s], None where it has none.
+    Fields: format; axes and places (T, k) of each marker; unit of lengths and rate
+    [frames a second] that the file states, None where it does not; times t (T,) [s],
+    None where it has none.
     """
 
     format: str
@@ -52,11 +67,15 @@ class Capture:
         return self.values[found][:, place], axis
 
     def _marker(self, name: str) -> str | None:
-        """Full name of a marker; where 'subject:marker' is meant, the marker alone will do."""
+        """Full name of a marker; where 'subject:marker' is meant, the marker alone will
+        do.
+        """
         if name in self.axes:
             return name
         ends = [x for x in self.axes if x.rpartition(":")[-1] == name]
-        return ends[0] if len(ends) == 1 else None
+        if len(ends) == 1:
+            return ends[0]
+        return None
 
     def _missing(self, path: str | Path, name: str, marker: str, axis: str) -> str:
         """Sentence of an error: what is missing, and what is there."""
@@ -66,7 +85,10 @@ class Capture:
             axes = ", ".join(self.axes[whole])
             return f"{path}: marker `{name}` needs an axis, '{name} x': it has {axes}."
         if name.strip().lower() in (*PLACE, *TURN):
-            return f"{path}: axis `{name}` needs a marker, 'MARKER {name}', one of {there}."
+            return (
+                f"{path}: axis `{name}` needs a marker, 'MARKER {name}', one of "
+                f"{there}."
+            )
         found = self._marker(marker)
         if found is not None:
             return (
@@ -75,7 +97,8 @@ class Capture:
             )
         known = list(self.axes)
         return (
-            f"{path}: marker `{marker or name}` is missing{suggestion(marker or name, known)} in "
+            f"{path}: marker `{marker or name}` is "
+            f"missing{suggestion(marker or name, known)} in "
             f"{there}. A column is 'MARKER axis'."
         )
 
@@ -118,7 +141,9 @@ def _rows(path: Path, lines: Iterable[tuple[int, list[str]]], width: int) -> np.
         row = [_number(path, line, cell) for cell in cells[:width]]
         found.append(row + [np.nan] * (width - len(row)))
     if not found:
-        raise ValueError(f"{path}: there are no lines of numbers below the names of the markers.")
+        raise ValueError(
+            f"{path}: there are no lines of numbers below the names of the markers."
+        )
     return np.array(found)
 
 
@@ -141,12 +166,17 @@ def _check_once(path: Path, names: Sequence[str]) -> None:
     """Raise a ValueError unless each marker has its own name, and there is one."""
     twice = sorted({x for x in names if names.count(x) > 1})
     if twice or not names:
-        what = f"names markers twice: {', '.join(twice)}" if twice else "names no markers"
+        if twice:
+            what = f"names markers twice: {', '.join(twice)}"
+        else:
+            what = "names no markers"
         raise ValueError(f"{path}: the file {what}.")
 
 
 def _qualisys(path: Path, text: str) -> Capture:
-    """Qualisys TSV: rows KEY value, perhaps a row of names of columns; a lost marker is 0, 0, 0."""
+    """Qualisys TSV: rows KEY value, perhaps a row of names of columns; a lost marker is
+    0, 0, 0.
+    """
     lines = [line.split("\t") for line in text.splitlines()]
     head: dict[str, list[str]] = {}
     first = len(lines)
@@ -159,24 +189,32 @@ def _qualisys(path: Path, text: str) -> Capture:
     included = (head.get("DATA_INCLUDED") or ["3D"])[0]
     if included != "3D" or "MARKER_NAMES" not in head:
         raise ValueError(
-            f"{path}: DATA_INCLUDED must be 3D, places of markers (MARKER_NAMES), but is "
+            f"{path}: DATA_INCLUDED must be 3D, places of markers (MARKER_NAMES), but "
+            f"is "
             f"{included}: export the 3D data."
         )
     names = [name for name in head["MARKER_NAMES"] if name]
     _check_once(path, names)
-    body = [(k + 1, cells) for k, cells in enumerate(lines) if k >= first and any(cells)]
+    body = [
+        (k + 1, cells) for k, cells in enumerate(lines) if k >= first and any(cells)
+    ]
     if body and not any(_is_number(cell) for _, cells in body[:1] for cell in cells):
         body = body[1:]  # names of columns
     widest = max((len(cells) - (not cells[-1].strip()) for _, cells in body), default=0)
     before = max(widest - 3 * len(names), 0)  # frame, time
     if before > 2:
-        raise ValueError(f"{path}: lines have {before} cells more than {len(names)} markers need.")
+        raise ValueError(
+            f"{path}: lines have {before} cells more than {len(names)} markers need."
+        )
     values = _rows(path, body, before + 3 * len(names))
     places = values[:, before:].reshape(len(values), len(names), 3)
     lost = (places == 0).all(axis=2)
     places = np.where(lost[:, :, None], np.nan, places)
     rate = _stated(path, "FREQUENCY", (head.get("FREQUENCY") or [""])[0])
-    t = values[:, before - 1] if before == 2 else None
+    if before == 2:
+        t = values[:, before - 1]
+    else:
+        t = None
     found = dict(zip(names, places.swapaxes(0, 1)))
     return Capture("Qualisys TSV", dict.fromkeys(names, PLACE), found, None, rate, t)
 
@@ -185,14 +223,19 @@ def _stated(path: Path, key: str, cell: str) -> float | None:
     """A rate that a head states, > 0; None where it does not."""
     if not cell.strip():
         return None
-    rate = float(cell) if _is_number(cell) else 0.0
+    if _is_number(cell):
+        rate = float(cell)
+    else:
+        rate = 0.0
     if not 0 < rate < np.inf:
         raise ValueError(f"{path}: {key} must be a rate > 0, but is {cell!r}.")
     return rate
 
 
 def _trc(path: Path, text: str) -> Capture:
-    """TRC: keys and values in two rows, names above X1 Y1 Z1; a lost marker is empty."""
+    """TRC: keys and values in two rows, names above X1 Y1 Z1; a lost marker is
+    empty.
+    """
     lines = text.splitlines()
     if len(lines) < 5:
         raise ValueError(
@@ -226,7 +269,8 @@ def _unit(path: Path, key: str, cell: str) -> str | None:
 def _times(
     path: Path, frames: np.ndarray, t: np.ndarray, rate: float | None, digit: float
 ) -> np.ndarray:
-    """Times (T,) [s]: as in the file; those of equally spaced frames where their digits are few.
+    """Times (T,) [s]: as in the file; those of equally spaced frames where their digits
+    are few.
 
     `digit`: value of the last digit of times [s]. They must agree with the stated rate.
     """
@@ -237,7 +281,8 @@ def _times(
     apart = abs(step - per_frame / rate)
     if per_frame > 0 and apart > digit + RATE_WITHIN / rate:
         raise ValueError(
-            f"{path}: the file states {rate:g} frames a second, but its times are {step:g} s "
+            f"{path}: the file states {rate:g} frames a second, but its times are "
+            f"{step:g} s "
             f"apart, {1 / step:.6g} a second: which one is right? Correct the file."
         )
     running = (np.diff(frames) == 1).all()
@@ -247,26 +292,43 @@ def _times(
 
 
 def _optitrack(path: Path, text: str) -> Capture:
-    """CSV of OptiTrack Motive: a row of keys and values, rows of names; lost is empty."""
+    """CSV of OptiTrack Motive: a row of keys and values, rows of names; lost is
+    empty.
+    """
     lines = [line.split(",") for line in text.splitlines()]
     first = [x.strip().strip('"') for x in lines[0]]
     head = dict(zip(first[::2], first[1::2]))
     start, names, kinds, axes = _heads_of_optitrack(path, lines)
     places: dict[str, dict[str, int]] = {}
     for k in range(2, len(axes)):
-        kind = kinds[k] if k < len(kinds) else ""
+        if k < len(kinds):
+            kind = kinds[k]
+        else:
+            kind = ""
         if kind in ("Position", "Rotation") and k < len(names) and names[k]:
             axis = axes[k].lower()
-            places.setdefault(names[k], {})[axis if kind == "Position" else f"q{axis}"] = k
+            places.setdefault(names[k], {})[
+                axis if kind == "Position" else f"q{axis}"
+            ] = k
     turns = head.get("Rotation Type", "Quaternion")
     if turns != "Quaternion":  # angles about axes are no quaternions
-        places = {x: {a: k for a, k in of.items() if a in PLACE} for x, of in places.items()}
-    body = [(k + 1, x) for k, x in enumerate(lines) if k > start and any(c.strip() for c in x)]
+        places = {
+            x: {a: k for a, k in of.items() if a in PLACE} for x, of in places.items()
+        }
+    body = [
+        (k + 1, x)
+        for k, x in enumerate(lines)
+        if k > start and any(c.strip() for c in x)
+    ]
     values = _rows(path, body, len(axes))
-    order = {x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()}
+    order = {
+        x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()
+    }
     found = {x: values[:, [places[x][a] for a in order[x]]] for x in places}
     rate = _stated(
-        path, "rate", head.get("Export Frame Rate") or head.get("Capture Frame Rate", "")
+        path,
+        "rate",
+        head.get("Export Frame Rate") or head.get("Capture Frame Rate", ""),
     )
     unit = _unit(path, "Length Units", head.get("Length Units", ""))
     digits = max(len(x[1].strip().partition(".")[-1]) for _, x in body)
@@ -277,7 +339,8 @@ def _optitrack(path: Path, text: str) -> Capture:
 def _heads_of_optitrack(
     path: Path, lines: list[list[str]]
 ) -> tuple[int, list[str], list[str], list[str]]:
-    """Number of the row Frame, and the rows of names, of Position or Rotation, and of axes.
+    """Number of the row Frame, and the rows of names, of Position or Rotation, and of
+    axes.
 
     Rows are Type, Name, ID, perhaps Parent; older files leave these words out.
     """
@@ -292,11 +355,15 @@ def _heads_of_optitrack(
                 return k, names[0], kinds[-1], row
         if any(row) and len(row) > 1:
             found.append(row)
-    raise ValueError(f"{path}: rows Name, Position or Rotation, and Frame must be in the head.")
+    raise ValueError(
+        f"{path}: rows Name, Position or Rotation, and Frame must be in the head."
+    )
 
 
 def _vicon(path: Path, text: str) -> Capture:
-    """CSV of Vicon Nexus: its part Trajectories, to the next empty line; lost is empty."""
+    """CSV of Vicon Nexus: its part Trajectories, to the next empty line; lost is
+    empty.
+    """
     lines = [[x.strip() for x in line.split(",")] for line in text.splitlines()]
     if len(lines) < 5:
         raise ValueError(f"{path}: the part Trajectories has a head of five lines.")
@@ -305,7 +372,9 @@ def _vicon(path: Path, text: str) -> Capture:
     _check_once(path, names)
     units = {x for x in lines[4] if x}
     if len(units) != 1:
-        raise ValueError(f"{path}, line 5: all units must be the same, but are {sorted(units)}.")
+        raise ValueError(
+            f"{path}, line 5: all units must be the same, but are {sorted(units)}."
+        )
     body = []
     for k, cells in enumerate(lines[5:], 6):
         if not any(cells):
@@ -314,17 +383,24 @@ def _vicon(path: Path, text: str) -> Capture:
     values = _rows(path, body, 2 + 3 * len(names))
     found = _in_threes(names, values[:, 2:])
     frames = values[:, 0]
-    t = None if rate is None else (frames - 1) / rate
+    if rate is None:
+        t = None
+    else:
+        t = (frames - 1) / rate
     unit = _unit(path, "line 5", units.pop())
     return Capture("Vicon CSV", dict.fromkeys(names, PLACE), found, unit, rate, t)
 
 
 def _c3d(path: Path) -> Capture:
-    """C3D by ezc3d; times are (number of the frame - 1) / rate; residual < 0 is lost."""
+    """C3D by ezc3d; times are (number of the frame - 1) / rate; residual < 0 is
+    lost.
+    """
     ezc3d = needed("ezc3d", "pip install 'jimpact[motion-capture]'")
     file = ezc3d.c3d(str(path))
     point = file["parameters"]["POINT"]
-    names = [str(x).strip() for x in point["LABELS"]["value"]][: file["data"]["points"].shape[1]]
+    names = [str(x).strip() for x in point["LABELS"]["value"]][
+        : file["data"]["points"].shape[1]
+    ]
     _check_once(path, names)
     places = np.moveaxis(file["data"]["points"][:3], 0, -1).copy()  # (markers, T, 3)
     lost = file["data"]["meta_points"]["residuals"][0] < 0
@@ -334,17 +410,25 @@ def _c3d(path: Path) -> Capture:
     first = int(file["header"]["points"]["first_frame"])  # from 0
     t = (first + np.arange(places.shape[1])) / rate
     unit = _unit(path, "POINT:UNITS", str(units[0]))
-    return Capture("C3D", dict.fromkeys(names, PLACE), dict(zip(names, places)), unit, rate, t)
+    return Capture(
+        "C3D", dict.fromkeys(names, PLACE), dict(zip(names, places)), unit, rate, t
+    )
 
 
 def check_not_zero(path: str | Path, name: str, places: np.ndarray) -> None:
-    """Raise where a marker (T, k) is at exactly 0 in some frames at an end: it was lost there."""
+    """Raise where a marker (T, k) is at exactly 0 in some frames at an end: it was lost
+    there.
+    """
     zero = (places == 0).all(axis=1)
     runs = {"first": zero, "last": zero[::-1]}
     for end, some in runs.items():
-        count = len(some) if some.all() else int(np.argmin(some))
+        if some.all():
+            count = len(some)
+        else:
+            count = int(np.argmin(some))
         if count >= AT_AN_END:
             raise ValueError(
-                f"{path}: marker `{name}` is at exactly 0, 0, 0 in the {end} {count} frames, as "
+                f"{path}: marker `{name}` is at exactly 0, 0, 0 in the {end} {count} "
+                f"frames, as "
                 "some programs write what was not seen: make these cells empty."
             )

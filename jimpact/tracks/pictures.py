@@ -38,7 +38,8 @@ def track(track: Track, title: str = "") -> Figure:
     heading = title or counted(count, "impact")
     figure, panels = new_figure(_HEIGHT * n, heading, n, 2, squeeze=False)
     for c, (places, rest) in enumerate(panels):
-        colour, unit = COLOURS[c % len(COLOURS)], track.units[c].split("/")[0]
+        colour = COLOURS[c % len(COLOURS)]
+        unit = track.units[c].split("/")[0]
         fitted = measured[:, c] - track.residual[:, c] * track.sigma[c]
         places.plot(track.t, measured[:, c], ".", color=GREY)
         for frames in track.flights:
@@ -49,5 +50,7 @@ def track(track: Track, title: str = "") -> Figure:
                 axis.axvline(each.time, color=GREY, linestyle=":")
         places.set(xlabel="time [s]", ylabel=f"coordinate {c + 1} [{unit}]")
         rest.set(xlabel="time [s]", ylabel="residual / sigma")
-        rest.set_ylim(*np.array([-1, 1]) * max(_BEYOND, np.nanmax(np.abs(track.residual[:, c]))))
+        rest.set_ylim(
+            *np.array([-1, 1]) * max(_BEYOND, np.nanmax(np.abs(track.residual[:, c])))
+        )
     return figure

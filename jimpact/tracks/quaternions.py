@@ -1,4 +1,6 @@
-"""Poses as a tracker writes them: the order of the quaternion, its length, moments of inertia."""
+"""Poses as a tracker writes them: the order of the quaternion, its length, moments of
+inertia.
+"""
 
 from typing import Any
 
@@ -8,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from jimpact.tools.checks import check_choice
 
 ORDERS = {"wxyz": (1, 2, 3, 0), "xyzw": (0, 1, 2, 3)}  # where x, y, z, w stand
-# How far a measured quaternion may be from length 1; with three digits it is off by less. Ten times
-# more would pass angles for quaternions in one of ten frames.
+# How far a measured quaternion may be from length 1; with three digits it is off by
+# less. Ten times more would pass angles for quaternions in one of ten frames.
 LENGTH_WITHIN = 1e-2
 
 
@@ -19,7 +21,8 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
     q = np.array(q, float)
     if q.ndim != 2 or q.shape[1] != 7:
         raise ValueError(
-            "Argument `q` must have shape (T, 7), x, y, z and a quaternion, as `quaternion` is "
+            "Argument `q` must have shape (T, 7), x, y, z and a quaternion, as "
+            "`quaternion` is "
             f"given, but has shape {q.shape}."
         )
     e = q[:, 3:][:, np.roll(ORDERS[order], 1)]
@@ -28,34 +31,50 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
     if far.any():
         k = int(far.argmax())
         raise ValueError(
-            f"Argument `q` must have quaternions of length 1, but that of frame {k + 1} has length "
+            f"Argument `q` must have quaternions of length 1, but that of frame "
+            f"{k + 1} has length "
             f"{length[k]:.4g}. Are these angles? A lost frame must be NaN, not 0."
         )
     return q[:, :3], e / length[:, None]
 
 
 def as_inertia(inertia: Any) -> np.ndarray | None:
-    """Inertia (3, 3) from three moments or a matrix, checked; None where all moments are equal."""
+    """Inertia (3, 3) from three moments or a matrix, checked; None where all moments
+    are equal.
+    """
     if inertia is None:
         return None
     array = np.asarray(inertia, float)
-    array = np.diag(array) if array.shape == (3,) else array
-    symmetric = array.shape == (3, 3) and np.isfinite(array).all() and np.allclose(array, array.T)
-    moments = np.linalg.eigvalsh(array) if symmetric else np.zeros(3)
+    if array.shape == (3,):
+        array = np.diag(array)
+    symmetric = (
+        array.shape == (3, 3)
+        and np.isfinite(array).all()
+        and np.allclose(array, array.T)
+    )
+    if symmetric:
+        moments = np.linalg.eigvalsh(array)
+    else:
+        moments = np.zeros(3)
     if not moments[0] > 0:
         raise ValueError(
-            "Argument `inertia` must be three moments > 0 along the axes of the body, or a "
+            "Argument `inertia` must be three moments > 0 along the axes of the body, "
+            "or a "
             f"symmetric (3, 3), but has value {np.asarray(inertia).tolist()}."
         )
-    return None if np.allclose(moments, moments[0]) else array
+    if np.allclose(moments, moments[0]):
+        return None
+    return array
 
 
 def turns_since_first(e: np.ndarray) -> np.ndarray:
-    """Sums (T, 3) [rad] of turns from frame to frame about the axes of the body; NaN where lost.
+    """Sums (T, 3) [rad] of turns from frame to frame about the axes of the body; NaN
+    where lost.
 
     A turn is the rotation vector of `R_k^-1 R_(k+1)`.
     """
-    seen, sums = np.isfinite(e).all(axis=1), np.full((len(e), 3), np.nan)
+    seen = np.isfinite(e).all(axis=1)
+    sums = np.full((len(e), 3), np.nan)
     measured = Rotation.from_quat(e[seen], scalar_first=True)
     steps = (measured[:-1].inv() * measured[1:]).as_rotvec()
     sums[seen] = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -63,12 +82,16 @@ def turns_since_first(e: np.ndarray) -> np.ndarray:
 
 
 def in_the_other_order(e: np.ndarray, order: str) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternion (4,) if the file stood in the other order than `order`, and the matrix A (3, 3).
+    """Quaternion (4,) if the file stood in the other order than `order`, and the matrix
+    A (3, 3).
 
-    Poses turn evenly in either order, as it turns the unit sphere of quaternions only: frames
-    alone cannot tell. omega = 2 e* e' becomes A omega.
+    Poses turn evenly in either order, as it turns the unit sphere of quaternions only:
+    frames alone cannot tell. omega = 2 e* e' becomes A omega.
     """
-    shift = 1 if order == "wxyz" else -1
+    if order == "wxyz":
+        shift = 1
+    else:
+        shift = -1
     other = np.roll(e, shift)
     return other, (_left(other).T @ np.roll(_left(e), shift, axis=0))[1:, 1:]
 

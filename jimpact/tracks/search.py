@@ -13,21 +13,22 @@ from jimpact.tracks.frames import Frames, differences, least_noise, median
 from jimpact.tracks.held import free_flights
 from jimpact.tracks.waves import Errors
 
-# Times that frames are divided, each time by errors and a model that the last one gave. Three are
-# common; where they do not agree after so many, the last ones are taken.
+# Times that frames are divided, each time by errors and a model that the last one gave.
+# Three are common; where they do not agree after so many, the last ones are taken.
 ROUNDS = 8
-# Share by which sigma may differ from that which divided the frames. Ten times more would leave
-# impacts of a wrong sigma; ten times less divides most tracks once more.
+# Share by which sigma may differ from that which divided the frames. Ten times more
+# would leave impacts of a wrong sigma; ten times less divides most tracks once more.
 AGREEING = 0.1
-# Factor of an unknown sigma where no flight was found, or a flight of frames fits none; and how
-# often it is tried. Ten times would take all frames for one flight.
+# Factor of an unknown sigma where no flight was found, or a flight of frames fits none;
+# and how often it is tried. Ten times would take all frames for one flight.
 LARGER = 2.0
 ENLARGED = 3
-# Standard deviations of chi by which residuals must exceed a given sigma to take its place: of good
-# tracks one in a thousand. Twice as many would leave stated errors half too small.
+# Standard deviations of chi by which residuals must exceed a given sigma to take its
+# place: of good tracks one in a thousand. Twice as many would leave stated errors half
+# too small.
 BEYOND_SIGMA = 3.3
-# Frames on each side by which the instant of an impact is found where flights have waves, as a
-# share of the time of the waves. Ten times more are waves themselves.
+# Frames on each side by which the instant of an impact is found where flights have
+# waves, as a share of the time of the waves. Ten times more are waves themselves.
 LOCAL = 0.1
 FEWEST_LOCAL = 4
 MOST_STRIDES = 32  # parts of the track that windows of the first acceleration are
@@ -35,7 +36,9 @@ MOST_STRIDES = 32  # parts of the track that windows of the first acceleration a
 
 @dataclass(frozen=True)
 class Settings:
-    """What `find_impacts` is told: whether sigma is `estimated`, and its arguments by name."""
+    """What `find_impacts` is told: whether sigma is `estimated`, and its arguments by
+    name.
+    """
 
     estimated: bool
     contact: float
@@ -45,9 +48,11 @@ class Settings:
 
 @dataclass(frozen=True)
 class Search:
-    """State of the search: frames with their sigma, the model, and what was found by them.
+    """State of the search: frames with their sigma, the model, and what was found by
+    them.
 
-    `candidates` are flights of the division, `verdict` those of them that there is evidence for.
+    `candidates` are flights of the division, `verdict` those of them that there is
+    evidence for.
     """
 
     frames: Frames
@@ -63,7 +68,9 @@ class Search:
 
     @property
     def leaves_a_flight(self) -> bool:
-        """True if so many frames in a row as a flight has, between flights, fit none."""
+        """True if so many frames in a row as a flight has, between flights, fit
+        none.
+        """
         rows = np.concatenate(self.verdict.flights)
         seen = np.flatnonzero(self.frames.seen)
         used = np.isin(seen, rows)
@@ -71,13 +78,18 @@ class Search:
         return bool((np.diff(places) > self.settings.shortest).any())
 
     def agrees_with(self, flight: Flight, least: np.ndarray) -> bool:
-        """True if frames were divided by the errors, `least` or more, and the model they gave."""
+        """True if frames were divided by the errors, `least` or more, and the model
+        they gave.
+        """
         used = self.frames.sigma
         given = np.maximum(self.verdict.errors.sigma, least)
         same = (np.abs(given - used) <= AGREEING * used).all()
         longest = max(np.ptp(self.frames.t[some]) for some in self.verdict.flights)
         bend = np.abs(flight.acceleration - self.flight.acceleration) * longest**2 / 8
-        speed = np.ptp(self.frames.q[self.frames.seen], axis=0) if self.frames.seen.any() else 0.0
+        if self.frames.seen.any():
+            speed = np.ptp(self.frames.q[self.frames.seen], axis=0)
+        else:
+            speed = 0.0
         slowing = abs(flight.drag - self.flight.drag) * np.max(speed) ** 2 / 8
         return bool(same and (bend < used).all() and slowing < used.max())
 
@@ -85,7 +97,8 @@ class Search:
 def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
     """The model with a first value of an unknown acceleration.
 
-    Of two values, by windows of frames of two lengths, that by which a division costs less.
+    Of two values, by windows of frames of two lengths, that by which a division costs
+    less.
     """
     if not flight.unknown.any():
         return flight
@@ -100,7 +113,8 @@ def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
 
 
 def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
-    """Median acceleration of parabolas through five frames in a row that are `stride` apart.
+    """Median acceleration of parabolas through five frames in a row that are `stride`
+    apart.
 
     Of frames that were seen; 0 of too few.
     """
@@ -124,7 +138,8 @@ def searched(frames: Frames, flight: Flight, settings: Settings) -> Search:
     """Flights, model and errors that agree.
 
     1. Divide the frames into flights; leave out those in which the body is held.
-    2. Take those for which there is evidence; find errors and what is unknown of the model.
+    2. Take those for which there is evidence; find errors and what is unknown of the
+    model.
     3. Again by these, until frames are divided by what they gave.
     """
     flight = first_flight(frames, flight, settings.shortest)
@@ -142,9 +157,15 @@ def searched(frames: Frames, flight: Flight, settings: Settings) -> Search:
     return found
 
 
-def _agreed(frames: Frames, flight: Flight, settings: Settings, least: np.ndarray) -> Search:
-    """Rounds of the search until they agree; frames are divided by `least` sigma (n,) or more."""
-    search = _divided(frames.with_sigma(np.maximum(frames.sigma, least)), flight, settings)
+def _agreed(
+    frames: Frames, flight: Flight, settings: Settings, least: np.ndarray
+) -> Search:
+    """Rounds of the search until they agree; frames are divided by `least` sigma (n,)
+    or more.
+    """
+    search = _divided(
+        frames.with_sigma(np.maximum(frames.sigma, least)), flight, settings
+    )
     for _ in range(ROUNDS):
         fitted = flight.fitted_to(search.frames, search.verdict.flights)
         if search.agrees_with(fitted, least):
@@ -166,8 +187,10 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
         frames = frames.with_sigma(LARGER * frames.sigma)
     if not flights:
         raise ValueError(
-            "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
-            f"{frames.sigma.tolist()} at an acceleration of {flight.acceleration.tolist()}: are "
+            "Argument `q` must hold a flight, but no frames in a row lie on an arc "
+            "within sigma = "
+            f"{frames.sigma.tolist()} at an acceleration of "
+            f"{flight.acceleration.tolist()}: are "
             "these the units of q?"
         )
     free = free_flights(straight, flight.acceleration, flights)
@@ -176,10 +199,14 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
 
 
 def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
-    """Arcs of the flights of a search, and these; those without a jump of SMALLEST_JUMP joined."""
+    """Arcs of the flights of a search, and these; those without a jump of SMALLEST_JUMP
+    joined.
+    """
     verdict = search.verdict
     contact = search.settings.contact
-    start = Start(verdict.flights, verdict.flight, verdict.errors, verdict.bent, contact)
+    start = Start(
+        verdict.flights, verdict.flight, verdict.errors, verdict.bent, contact
+    )
     moving = False  # first at fixed instants, as nothing determines one without a jump
     while True:
         arcs = _arcs(search.frames, start, moving)
@@ -191,25 +218,32 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
             continue
         start = start.joined_at(int(np.argmin(jumps)))
     sigma = of_residuals(arcs, search.frames)
-    larger = sigma > start.errors.sigma * (1 + BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs)))
+    larger = sigma > start.errors.sigma * (
+        1 + BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs))
+    )
     if search.settings.estimated or larger.any():
         if not search.settings.estimated:
             sigma = np.where(larger, sigma, start.errors.sigma)
         errors = replace(start.errors, sigma=sigma)
-        again = replace(start, errors=errors, flight=arcs.flight, instants=arcs.instants[1:-1])
+        again = replace(
+            start, errors=errors, flight=arcs.flight, instants=arcs.instants[1:-1]
+        )
         arcs = _arcs(search.frames, again)
     return arcs, start.flights
 
 
 def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
-    """Arcs of flights; where these have waves, instants are found by frames near them alone.
+    """Arcs of flights; where these have waves, instants are found by frames near them
+    alone.
 
-    Unless `moving` instants stay where lines cross. Waves go on across an impact, so that measured
-    places meet there, though arcs are uncertain by the waves.
+    Unless `moving` instants stay where lines cross. Waves go on across an impact, so
+    that measured places meet there, though arcs are uncertain by the waves.
     """
     if not moving and start.instants is None:
         instants = crossings(frames, start.flights, start.flight)
-        still = replace(start, instants=instants, instant_errors=np.zeros_like(instants))
+        still = replace(
+            start, instants=instants, instant_errors=np.zeros_like(instants)
+        )
         return fit_arcs(frames, still)
     waves = start.errors.waves > 0
     if not waves.any() or len(start.flights) < 2:
@@ -232,7 +266,8 @@ def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
 def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
     """Arcs by frames of each flight within `window` [s] of its impacts only.
 
-    A flight keeps its one arc, so that velocities of both its ends stay those of one arc.
+    A flight keeps its one arc, so that velocities of both its ends stay those of one
+    arc.
     """
     near = []
     last = len(arcs.members) - 1
@@ -244,7 +279,8 @@ def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
         near.append(some[(distance <= window).any(axis=1)])
     if min(map(len, near)) < 3:
         raise ValueError(
-            f"Argument `window` must leave 3 frames or more of each flight, but {window:g} s leave "
+            f"Argument `window` must leave 3 frames or more of each flight, but "
+            f"{window:g} s leave "
             f"{min(map(len, near))}."
         )
     contact = search.settings.contact
@@ -254,10 +290,11 @@ def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
 
 
 def of_residuals(arcs: Arcs, frames: Frames) -> np.ndarray:
-    """Standard errors (n,): `sigma sqrt(chi^2 / freedom)` of residuals of coordinates without
-    waves.
+    """Standard errors (n,): `sigma sqrt(chi^2 / freedom)` of residuals of coordinates
+    without waves.
 
-    Freedom: frames, less K + 2 places, 1/n of K instants, accelerations that were found.
+    Freedom: frames, less K + 2 places, 1/n of K instants, accelerations that were
+    found.
     """
     sigma = arcs.errors.sigma
     scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / _freedom(arcs))
@@ -275,7 +312,9 @@ def _freedom(arcs: Arcs) -> np.ndarray:
 
 
 def doubts(search: Search, arcs: Arcs) -> np.ndarray:
-    """True (K,) for impacts that a flight of another acceleration explains about as well."""
+    """True (K,) for impacts that a flight of another acceleration explains about as
+    well.
+    """
     members: Sequence[np.ndarray] = arcs.members
     return doubtful(search.straight, members, arcs.flight, arcs.errors)
 

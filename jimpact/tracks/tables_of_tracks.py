@@ -1,4 +1,6 @@
-"""Tracks in tables, as trackers, loggers, motion capture and spreadsheets write them."""
+"""Tracks in tables, as trackers, loggers, motion capture and spreadsheets write
+them.
+"""
 
 import re
 import warnings
@@ -10,7 +12,13 @@ from typing import Any
 import numpy as np
 
 from jimpact.tools.checks import check_values, short_repr, suggestion
-from jimpact.tracks.motion_capture import PLACE, TURN, Capture, capture_of, check_not_zero
+from jimpact.tracks.motion_capture import (
+    PLACE,
+    TURN,
+    Capture,
+    capture_of,
+    check_not_zero,
+)
 
 # In m or rad
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
@@ -20,10 +28,20 @@ _MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a"}
 SEPARATORS = ("\t", ";", ",", None)  # None: any white space
 HEADER_LINES = 100  # among which the names of columns are looked for
 # Names of columns that hold numbers of frames, without blanks, marks and capitals
-FRAMES = {"frame", "frames", "frameidx", "frameindex", "framenumber", "frameno", "framenr"}
+FRAMES = {
+    "frame",
+    "frames",
+    "frameidx",
+    "frameindex",
+    "framenumber",
+    "frameno",
+    "framenr",
+}
 FRAMES |= {"frameid", "framenum"}
-LARGEST = 2_000_000_000  # bytes of a file; ten times more would not go into most memories
-ALIKE = 0.5  # steps dt differ by less than that share of themselves; times of frames do not
+# bytes of a file; ten times more would not go into most memories
+LARGEST = 2_000_000_000
+# steps dt differ by less than that share of themselves; times of frames do not
+ALIKE = 0.5
 Name = str | int
 
 
@@ -40,43 +58,48 @@ def read(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times and coordinates from a table of a tracker, a logger, or motion capture.
 
-    Text with a line of column names: any separator (tab, semicolon, comma, spaces) and any number
-    of lines before the names; `#` may be in names; delimiters at the ends of lines and empty cells
-    are allowed. A cell that is empty or NaN was not seen. Velocity columns of trackers span the
-    impact: read places.
+    Text with a line of column names: any separator (tab, semicolon, comma, spaces) and
+    any number of lines before the names; `#` may be in names; delimiters at the ends of
+    lines and empty cells are allowed. A cell that is empty or NaN was not seen.
+    Velocity columns of trackers span the impact: read places.
 
     Motion capture (Qualisys TSV, TRC, CSV of OptiTrack and Vicon, C3D with the extra
-    `motion-capture`): a column is 'MARKER axis', 'ball z'; axes are x, y, z as in the file, and qx,
-    qy, qz, qw of rigid bodies. Unit, rate and times are those of the file where it states them
-    (Qualisys states no unit). Lost frames are NaN, and are never filled.
+    `motion-capture`): a column is 'MARKER axis', 'ball z'; axes are x, y, z as in the
+    file, and qx, qy, qz, qw of rigid bodies. Unit, rate and times are those of the file
+    where it states them (Qualisys states no unit). Lost frames are NaN, and are never
+    filled.
 
     Args:
         path: of the file, up to 2 GB.
-        columns: names of those to read, as in the file; or their numbers, from 0, in a table
-            without names.
-        time: name or number of the column of times [s]; None: there is none, but a `rate`.
-        frame: name or number of the column of frame numbers, of which each frame has its own; its
-            time is the number over `rate`.
-        rate: frames a second, > 0; without `frame` each line is one. A rate that the file states
-            must be this.
-        unit: of the columns, one for all or one each: m, cm, mm, um, in, ft, rad, deg, or 1
-            of a quaternion. It is never guessed; a unit that the file or a name ('x [mm]') states
-            must be this. None: as stated there.
+        columns: names of those to read, as in the file; or their numbers, from 0, in a
+            table without names.
+        time: name or number of the column of times [s]; None: there is none, but a
+            `rate`.
+        frame: name or number of the column of frame numbers, of which each frame has
+            its own; its time is the number over `rate`.
+        rate: frames a second, > 0; without `frame` each line is one. A rate that the
+            file states must be this.
+        unit: of the columns, one for all or one each: m, cm, mm, um, in, ft, rad, deg,
+            or 1
+            of a quaternion. It is never guessed; a unit that the file or a name ('x
+            [mm]') states must be this. None: as stated there.
         decimal: '.' or ','.
-        where: of a long table with a row for each body and frame: the column, and what it must
-            hold, `{"body": "A"}`; other rows are left out.
+        where: of a long table with a row for each body and frame: the column, and what
+            it must hold, `{"body": "A"}`; other rows are left out.
 
     Returns:
-        t (T,) [s], q (T, n) [m] or [rad], NaN where not seen: what `find_impacts` takes. Times
-        that were rounded stay so: where frames are equally spaced, give `rate` instead.
+        t (T,) [s], q (T, n) [m] or [rad], NaN where not seen: what `find_impacts`
+        takes. Times that were rounded stay so: where frames are equally spaced, give
+        `rate` instead.
 
     Raises:
         FileNotFoundError: no such file.
         ImportError: a C3D file without ezc3d.
-        ValueError: neither or both of time and rate, an unknown unit, or not that of the file, no
-            such column or two, no such marker, text in a number, no line of names, times or frames
-            that do not rise (steps dt, two takes in one file), frames that are missing while `rate`
-            counts lines; with file, line and column.
+        ValueError: neither or both of time and rate, an unknown unit, or not that of
+            the file, no such column or two, no such marker, text in a number, no line
+            of names, times or frames that do not rise (steps dt, two takes in one
+            file), frames that are missing while `rate` counts lines; with file, line
+            and column.
 
     Warns:
         UserWarning: `rate` counts lines, but a column of frame numbers repeats them.
@@ -89,17 +112,23 @@ def read(
     >>> t.tolist(), q.ravel().round(3).tolist()
     ([0.0, 0.01, 0.02], [0.125, nan, 0.121])
     """
-    names = [columns] if isinstance(columns, str | int) else list(columns)
+    if isinstance(columns, str | int):
+        names = [columns]
+    else:
+        names = list(columns)
     if not names:
         raise ValueError("Argument `columns` must name a column, but is empty.")
     if rate is not None:
         check_values("rate", np.asarray(rate, float), low=0.0, open_low=True)
     if decimal not in (".", ","):
-        raise ValueError(f"Argument `decimal` must be '.' or ',', but has value {decimal!r}.")
+        raise ValueError(
+            f"Argument `decimal` must be '.' or ',', but has value {decimal!r}."
+        )
     size = Path(path).stat().st_size
     if size > LARGEST:
         raise ValueError(
-            f"{path}: a table must have {LARGEST / 1e9:g} GB at most, but has {size / 1e9:.3g}: "
+            f"{path}: a table must have {LARGEST / 1e9:g} GB at most, but has "
+            f"{size / 1e9:.3g}: "
             "cut it into takes, or leave out columns."
         )
     capture = capture_of(Path(path))
@@ -122,28 +151,39 @@ def _of_capture(
     unit: str | Sequence[str] | None,
     given: Mapping[str, Any],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times and coordinates of a table of motion capture; `given`: arguments it does not take."""
+    """Times and coordinates of a table of motion capture; `given`: arguments it does
+    not take.
+    """
     wrong = [name for name, value in given.items() if value is not None]
     if wrong:
         raise ValueError(
-            f"Argument `{wrong[0]}` is not for {capture.format}: its times and frames are known."
+            f"Argument `{wrong[0]}` is not for {capture.format}: its times and frames "
+            f"are known."
         )
     found = [capture.column(path, str(name)) for name in names]
     lengths = [k for k, (_, axis) in enumerate(found) if axis in PLACE]
     own = _unit_of_capture(path, capture, unit, len(found), lengths)
-    if rate is not None and capture.rate is not None and not np.isclose(rate, capture.rate, 1e-3):
+    if (
+        rate is not None
+        and capture.rate is not None
+        and not np.isclose(rate, capture.rate, 1e-3)
+    ):
         raise ValueError(
-            f"{path}: the file states {capture.rate:g} frames a second, but argument `rate` is "
+            f"{path}: the file states {capture.rate:g} frames a second, but argument "
+            f"`rate` is "
             f"{rate:g}."
         )
-    rate = capture.rate if capture.rate is not None else rate
+    if capture.rate is not None:
+        rate = capture.rate
     q = np.stack([values for values, _ in found], axis=1)
     if capture.t is not None:
         t = capture.t
     elif rate is not None:
         t = np.arange(len(q)) / rate
     else:
-        raise ValueError(f"{path}: {capture.format} states no rate here: give argument `rate`.")
+        raise ValueError(
+            f"{path}: {capture.format} states no rate here: give argument `rate`."
+        )
     _check_rising(path, "the times", t)
     if capture.format != "Qualisys TSV":
         for marker in dict.fromkeys(str(name).rpartition(" ")[0] for name in names):
@@ -154,7 +194,9 @@ def _of_capture(
 
 def _check_seen(path: str | Path, capture: Capture, marker: str) -> None:
     """Raise where a marker lies at exactly 0 at an end, see `check_not_zero`."""
-    whole = next(x for x in capture.axes if x == marker or x.rpartition(":")[-1] == marker)
+    whole = next(
+        x for x in capture.axes if x == marker or x.rpartition(":")[-1] == marker
+    )
     places = [k for k, axis in enumerate(capture.axes[whole]) if axis not in TURN]
     check_not_zero(path, marker, capture.values[whole][:, places])
 
@@ -167,28 +209,41 @@ def _unit_of_capture(
     lengths: Sequence[int],
 ) -> str:
     """Unit of lengths: that of the file, which one that is given beside must be."""
-    given = [unit] * count if isinstance(unit, str) else list(unit or ())
+    if isinstance(unit, str):
+        given = [unit] * count
+    else:
+        given = list(unit or ())
     if unit is not None and len(given) != count:
         raise ValueError(
             f"Argument `unit` must be one for all, or one for each of {count} columns."
         )
-    own = {given[k] for k in lengths} if given else set()
+    if given:
+        own = {given[k] for k in lengths}
+    else:
+        own = set()
     if capture.unit is None and lengths and not own:
-        raise ValueError(f"{path}: {capture.format} states no unit: give argument `unit`.")
+        raise ValueError(
+            f"{path}: {capture.format} states no unit: give argument `unit`."
+        )
     if len(own) > 1 or own - set(UNITS):
         raise ValueError(
-            f"Argument `unit` must be one unit of all lengths, one of {', '.join(UNITS)}, but has "
+            f"Argument `unit` must be one unit of all lengths, one of "
+            f"{', '.join(UNITS)}, but has "
             f"value {short_repr(unit)}."
         )
     stated = capture.unit or next(iter(own), "m")
     if own and own != {stated}:
-        raise ValueError(f"{path}: the file states the unit {stated}, but `unit` is {own.pop()!r}.")
+        raise ValueError(
+            f"{path}: the file states the unit {stated}, but `unit` is {own.pop()!r}."
+        )
     return stated
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """What `read` is told of rows: columns of times and of frame numbers, and which rows."""
+    """What `read` is told of rows: columns of times and of frame numbers, and which
+    rows.
+    """
 
     time: Name | None
     frame: Name | None
@@ -197,14 +252,18 @@ class _Rows:
 
 @dataclass(frozen=True)
 class _Table:
-    """Columns (T, n), that of times or of frame numbers (T,), and numbers of frames beside them."""
+    """Columns (T, n), that of times or of frame numbers (T,), and numbers of frames
+    beside them.
+    """
 
     values: np.ndarray
     order: np.ndarray | None
     beside: tuple[str, np.ndarray] | None
 
 
-def _table(path: str | Path, names: Sequence[Name], rows: _Rows, decimal: str) -> _Table:
+def _table(
+    path: str | Path, names: Sequence[Name], rows: _Rows, decimal: str
+) -> _Table:
     """The columns of a table of text."""
     text = Path(path).read_bytes().decode("utf-8-sig", errors="replace")
     lines = text.splitlines()
@@ -213,28 +272,45 @@ def _table(path: str | Path, names: Sequence[Name], rows: _Rows, decimal: str) -
     numbered = [isinstance(name, int) for name in wanted]
     if any(numbered) and not all(numbered):
         raise ValueError(
-            f"Columns must all be names, or all numbers, but are {', '.join(map(repr, wanted))}."
+            f"Columns must all be names, or all numbers, but are "
+            f"{', '.join(map(repr, wanted))}."
         )
     if all(numbered):
         start, separator = _without_names(path, lines, wanted, decimal)
         header: list[str] = []
         places = [int(name) for name in wanted]
     else:
-        start, separator, header = _header(path, lines, [str(x) for x in wanted], decimal)
+        start, separator, header = _header(
+            path, lines, [str(x) for x in wanted], decimal
+        )
         places = [_place(path, header, str(name)) for name in wanted]
-    body = [(k, _cells(line, separator)) for k, line in enumerate(lines, 1) if k > start]
+    body = [
+        (k, _cells(line, separator)) for k, line in enumerate(lines, 1) if k > start
+    ]
     body = [(k, cells) for k, cells in body if any(cell.strip() for cell in cells)]
     if body and not any(char.isdigit() for cell in body[0][1] for char in cell):
         body = body[1:]  # a line of units
     if rows.where:
-        body = _chosen(path, body, dict(zip(rows.where, places[-len(rows.where) :])), rows.where)
+        body = _chosen(
+            path, body, dict(zip(rows.where, places[-len(rows.where) :])), rows.where
+        )
     if not body:
-        raise ValueError(f"{path}: there are no lines of numbers below the names of the columns.")
+        raise ValueError(
+            f"{path}: there are no lines of numbers below the names of the columns."
+        )
     count = len(names) + len(of_rows)
     labels = [str(x) for x in wanted[:count]]
-    values = np.array([_numbers(path, k, x, places[:count], labels, decimal) for k, x in body])
-    order = values[:, -1] if of_rows else None
-    beside = None if rows.frame is not None else _frames_beside(header, body)
+    values = np.array(
+        [_numbers(path, k, x, places[:count], labels, decimal) for k, x in body]
+    )
+    if of_rows:
+        order = values[:, -1]
+    else:
+        order = None
+    if rows.frame is not None:
+        beside = None
+    else:
+        beside = _frames_beside(header, body)
     return _Table(values[:, : len(names)], order, beside)
 
 
@@ -251,7 +327,9 @@ def _chosen(
         found = [row for row, cell in zip(body, there) if _same(cell, value)]
         if not found:
             listed = ", ".join(sorted(set(there))[:10])
-            raise ValueError(f"{path}: no row has {value!r} in column `{name}`, but {listed}.")
+            raise ValueError(
+                f"{path}: no row has {value!r} in column `{name}`, but {listed}."
+            )
         body = found
     return body
 
@@ -269,7 +347,9 @@ def _same(cell: str, value: Any) -> bool:
 def _frames_beside(
     header: Sequence[str], body: Sequence[tuple[int, list[str]]]
 ) -> tuple[str, np.ndarray] | None:
-    """Name and numbers of a column of frame numbers that was not asked for; None without."""
+    """Name and numbers of a column of frame numbers that was not asked for; None
+    without.
+    """
     for place, name in enumerate(header):
         if re.sub(r"[^a-z]", "", name.lower()) not in FRAMES:
             continue
@@ -280,18 +360,25 @@ def _frames_beside(
 
 
 def _times(
-    path: str | Path, table: _Table, time: Name | None, frame: Name | None, rate: float | None
+    path: str | Path,
+    table: _Table,
+    time: Name | None,
+    frame: Name | None,
+    rate: float | None,
 ) -> np.ndarray:
     """Times (T,) [s] of the rows: of their column, of frame numbers, or of lines."""
     if frame is not None:
         if rate is None or time is not None:
-            raise ValueError("Argument `frame` needs `rate`, frames a second, and no `time`.")
+            raise ValueError(
+                "Argument `frame` needs `rate`, frames a second, and no `time`."
+            )
         assert table.order is not None
         _check_rising(path, f"column `{frame}` of frame numbers", table.order)
         return table.order / rate
     if (time is None) == (rate is None):
         raise ValueError(
-            "Either argument `time` (a column) or `rate` (frames a second) must be given, but "
+            "Either argument `time` (a column) or `rate` (frames a second) must be "
+            "given, but "
             f"{'neither' if time is None else 'both'} are."
         )
     if rate is None:
@@ -304,18 +391,22 @@ def _times(
 
 
 def _check_lines_are_frames(path: str | Path, name: str, frames: np.ndarray) -> None:
-    """Raise where frame numbers jump, though lines are counted; warn where they repeat."""
+    """Raise where frame numbers jump, though lines are counted; warn where they
+    repeat.
+    """
     steps = np.diff(frames)
     jumps = (steps > 1) | (steps < 0)
     if jumps.any():
         k = int(jumps.argmax())
         raise ValueError(
-            f"{path}: column `{name}` goes from {frames[k]:g} to {frames[k + 1]:g}, but argument "
+            f"{path}: column `{name}` goes from {frames[k]:g} to {frames[k + 1]:g}, "
+            f"but argument "
             f"`rate` counts every line as a frame: give frame={name!r} beside it."
         )
     if (steps == 0).any():
         warnings.warn(
-            f"{path}: column `{name}` repeats frames, but argument `rate` counts every line as "
+            f"{path}: column `{name}` repeats frames, but argument `rate` counts every "
+            f"line as "
             f"one: give frame={name!r}, and `where` to choose a body.",
             UserWarning,
             stacklevel=4,
@@ -332,7 +423,8 @@ def _check_times(path: str | Path, name: str, t: np.ndarray) -> None:
     steady = len(t) > 2 and np.ptp(t) < ALIKE * t.mean() and t.min() > 0
     if steady and not (np.diff(t) > 0).all():
         raise ValueError(
-            f"{path}: column `{name}` holds steps between frames, about {np.median(t):.4g} s, not "
+            f"{path}: column `{name}` holds steps between frames, about "
+            f"{np.median(t):.4g} s, not "
             "times: write their sums into a column, or give `rate`."
         )
     _check_rising(path, f"column `{name}`", t)
@@ -344,18 +436,20 @@ def _check_rising(path: str | Path, what: str, t: np.ndarray) -> None:
     if (steps > 0).all():
         return
     k = int(np.argmin(steps > 0))
-    why = (
-        "is this a long table of several bodies (`where`)?"
-        if steps[k] == 0
-        else "are these two takes in one file, or several bodies (`where`)?"
-    )
+    if steps[k] == 0:
+        why = "is this a long table of several bodies (`where`)?"
+    else:
+        why = "are these two takes in one file, or several bodies (`where`)?"
     raise ValueError(
-        f"{path}: {what} must rise, but goes from {t[k]:g} to {t[k + 1]:g} at row {k + 2}: {why}"
+        f"{path}: {what} must rise, but goes from {t[k]:g} to {t[k + 1]:g} at row "
+        f"{k + 2}: {why}"
     )
 
 
 def _units(unit: str | Sequence[str] | None, names: Sequence[Name]) -> list[str]:
-    """Unit of each column, one of `UNITS`, from one for all or one each; None: as names state."""
+    """Unit of each column, one of `UNITS`, from one for all or one each; None: as names
+    state.
+    """
     if unit is None:
         stated = [stated_unit(str(name)) for name in names]
         if not all(stated):
@@ -365,11 +459,16 @@ def _units(unit: str | Sequence[str] | None, names: Sequence[Name]) -> list[str]
             )
         units = [str(each) for each in stated]
     else:
-        units = [unit] * len(names) if isinstance(unit, str) else list(unit)
+        if isinstance(unit, str):
+            units = [unit] * len(names)
+        else:
+            units = list(unit)
     if len(units) != len(names) or not all(each in UNITS for each in units):
         raise ValueError(
-            f"Argument `unit` must be one of {', '.join(UNITS)}, or one for each of {len(names)} "
-            f"columns, but has value {short_repr(unit)}. Pixels are no lengths: multiply by metres "
+            f"Argument `unit` must be one of {', '.join(UNITS)}, or one for each of "
+            f"{len(names)} "
+            f"columns, but has value {short_repr(unit)}. Pixels are no lengths: "
+            f"multiply by metres "
             "per pixel, and mind that y may point down."
         )
     return units
@@ -379,7 +478,9 @@ def stated_unit(name: str) -> str | None:
     """Unit in brackets in the name of a column; None without."""
     stated = re.search(rf"[\[(]\s*({_OTHER})\s*[\])]", name)
     own = {"µm": "um", "°": "deg"}
-    return own.get(stated[1], stated[1]) if stated else None
+    if stated:
+        return own.get(stated[1], stated[1])
+    return None
 
 
 def _check_unit_in_name(path: str | Path, name: str, unit: str) -> None:
@@ -387,13 +488,17 @@ def _check_unit_in_name(path: str | Path, name: str, unit: str) -> None:
     stated = stated_unit(name)
     if stated and stated != unit:
         raise ValueError(
-            f"{path}: column `{name}` states the unit {stated}, but argument `unit` is {unit!r}."
+            f"{path}: column `{name}` states the unit {stated}, but argument `unit` is "
+            f"{unit!r}."
         )
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
     """The cells of a line, without quotes and blanks."""
-    parts = line.split() if separator is None else line.split(separator)
+    if separator is None:
+        parts = line.split()
+    else:
+        parts = line.split(separator)
     return [part.strip().strip('"').strip() for part in parts]
 
 
@@ -402,7 +507,8 @@ def _without_names(
 ) -> tuple[int, str | None]:
     """Number of lines before the numbers of a table without names, and its separator.
 
-    The first line, and for it the first separator, whose cells with these numbers hold numbers.
+    The first line, and for it the first separator, whose cells with these numbers hold
+    numbers.
     """
     last = max(int(name) for name in wanted)
     for k, line in enumerate(lines[:HEADER_LINES]):
@@ -411,7 +517,8 @@ def _without_names(
             if len(cells) > last and _is_number(cells[int(wanted[0])], decimal):
                 return k, separator
     raise ValueError(
-        f"{path}: no line has a number in column {wanted[0]} and {last + 1} columns (they are "
+        f"{path}: no line has a number in column {wanted[0]} and {last + 1} columns "
+        f"(they are "
         "counted from 0)."
     )
 
@@ -419,7 +526,8 @@ def _without_names(
 def _header(
     path: str | Path, lines: list[str], wanted: list[str], decimal: str
 ) -> tuple[int, str | None, list[str]]:
-    """Number (from 1) of the line that holds the names `wanted`, its separator, and all its names.
+    """Number (from 1) of the line that holds the names `wanted`, its separator, and all
+    its names.
 
     The first line, and for it the first separator, with which all are among its cells.
     """
@@ -437,15 +545,19 @@ def _header(
     missing = next((name for name in wanted if name not in likely), wanted[0])
     named = [cell for cell in likely if cell]
     raise ValueError(
-        f"{path}: no line holds the names {', '.join(f'`{name}`' for name in wanted)} of columns; "
-        f"`{missing}` is missing{suggestion(missing, named)} in {', '.join(named) or 'the file'}."
+        f"{path}: no line holds the names {', '.join(f'`{name}`' for name in wanted)} "
+        f"of columns; "
+        f"`{missing}` is missing{suggestion(missing, named)} in "
+        f"{', '.join(named) or 'the file'}."
     )
 
 
 def _place(path: str | Path, header: list[str], name: str) -> int:
     """Index of the column of this name; a ValueError unless it is there once."""
     if (count := header.count(name.strip())) != 1:
-        raise ValueError(f"{path}: column `{name}` must be there once, but is {count} times.")
+        raise ValueError(
+            f"{path}: column `{name}` must be there once, but is {count} times."
+        )
     return header.index(name.strip())
 
 
@@ -466,17 +578,26 @@ def _numbers(
     names: list[str],
     decimal: str,
 ) -> list[float]:
-    """Numbers of a line in the columns `places`; NaN where a cell is empty or the line shorter."""
+    """Numbers of a line in the columns `places`; NaN where a cell is empty or the line
+    shorter.
+    """
     values = []
     for place, name in zip(places, names):
-        cell = cells[place] if place < len(cells) else ""
+        if place < len(cells):
+            cell = cells[place]
+        else:
+            cell = ""
         if cell.lower() in _MISSING:
             values.append(np.nan)
             continue
-        other = "," if decimal == "." else "."
+        if decimal == ".":
+            other = ","
+        else:
+            other = "."
         if other in cell or not _is_number(cell, decimal):
             raise ValueError(
-                f"{path}, line {line}, column `{name}`: {cell!r} must be a number with the decimal "
+                f"{path}, line {line}, column `{name}`: {cell!r} must be a number with "
+                f"the decimal "
                 f"mark {decimal!r} (argument `decimal`)."
             )
         values.append(float(cell.replace(decimal, ".")))

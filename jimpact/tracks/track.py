@@ -19,14 +19,15 @@ from jimpact.tracks.frames import Frames
 from jimpact.tracks.held import held_flights
 from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
 
-# A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
-# times more would pass impacts with something else than the contacts.
+# A jump of velocities lies in the cone of a scene's impulses up to so many standard
+# errors. Ten times more would pass impacts with something else than the contacts.
 OUT_OF_CONE = 5.0
-# ... or up to this share of the jump, by kinetic energy: bodies and calibrations differ from their
-# model. Ten times more is all of it; ten times less drops most measured impacts of a square.
+# ... or up to this share of the jump, by kinetic energy: bodies and calibrations differ
+# from their model. Ten times more is all of it; ten times less drops most measured
+# impacts of a square.
 SHARE_OUT = 0.2
-# Share of the trace by which moments of inertia may differ from those of the body of a scene. Ten
-# times more is a tenth: flights would turn otherwise by degrees.
+# Share of the trace by which moments of inertia may differ from those of the body of a
+# scene. Ten times more is a tenth: flights would turn otherwise by degrees.
 INERTIA_WITHIN = 0.01
 
 
@@ -34,8 +35,9 @@ INERTIA_WITHIN = 0.01
 class TrackImpact:
     """One impact of a track.
 
-    Fields: time and its standard error time_error [s]; coordinates q (n,) at that instant;
-    velocities pre and post (n,); covariance (2n, 2n) of (pre, post), with the error of the instant;
+    Fields: time and its standard error time_error [s]; coordinates q (n,) at that
+    instant; velocities pre and post (n,); covariance (2n, 2n) of (pre, post), with the
+    error of the instant;
     doubtful: a flight of another acceleration explains its frames about as well.
     """
 
@@ -48,7 +50,8 @@ class TrackImpact:
     doubtful: bool = False
 
     def not_in(self, order: str) -> "TrackImpact":
-        """Impact as if the quaternions of the file stood in the other order than `order`.
+        """Impact as if the quaternions of the file stood in the other order than
+        `order`.
 
         omega becomes A omega, with A of `in_the_other_order`; its covariance follows.
         """
@@ -56,21 +59,24 @@ class TrackImpact:
         gain = np.eye(12)
         gain[3:6, 3:6] = gain[9:, 9:] = A
         pre, post = np.split(gain @ np.concatenate([self.pre, self.post]), 2)
-        q, covariance = np.append(self.q[:3], other), gain @ self.covariance @ gain.T
+        q = np.append(self.q[:3], other)
+        covariance = gain @ self.covariance @ gain.T
         return replace(self, q=q, pre=pre, post=post, covariance=covariance)
 
 
 @dataclass(frozen=True)
 class Track:
-    """A track: its impacts, flights (frames of each), sigma (n,), covariance, warnings, units.
+    """A track: its impacts, flights (frames of each), sigma (n,), covariance, warnings,
+    units.
 
-    `covariance` (2nK, 2nK) is that of (v-, v+) of all impacts in turn: successive ones share a
-    flight. `t` (T,) and `q` (T, n) are the frames, `residual` (T, n) in units of sigma, NaN where a
-    frame was not used; `units` are those of the velocities; `acceleration` (n,) that of all
-    flights. Of poses q is (T, 7), the quaternion's scalar first, whatever the `order` of the file;
-    residuals and sigma are those of places and of turns about the axes of the body, and `inertia`
-    is as given, None as of a sphere. `candidates` say how many impacts there is no evidence for,
-    and why; `name` is the label of its shots.
+    `covariance` (2nK, 2nK) is that of (v-, v+) of all impacts in turn: successive ones
+    share a flight. `t` (T,) and `q` (T, n) are the frames, `residual` (T, n) in units
+    of sigma, NaN where a frame was not used; `units` are those of the velocities;
+    `acceleration` (n,) that of all flights. Of poses q is (T, 7), the quaternion's
+    scalar first, whatever the `order` of the file; residuals and sigma are those of
+    places and of turns about the axes of the body, and `inertia` is as given, None as
+    of a sphere. `candidates` say how many impacts there is no evidence for, and why;
+    `name` is the label of its shots.
     """
 
     impacts: tuple[TrackImpact, ...]
@@ -94,7 +100,9 @@ class Track:
 
     @property
     def coordinates(self) -> np.ndarray:
-        """Coordinates q (T, n); of poses places, and turns about axes of the body since frame 1."""
+        """Coordinates q (T, n); of poses places, and turns about axes of the body since
+        frame 1.
+        """
         if self.order is None:
             return self.q
         return np.hstack([self.q[:, :3], turns_since_first(self.q[:, 3:])])
@@ -111,10 +119,14 @@ class Track:
 
     def __str__(self) -> str:
         """The impacts, a line each, and the warnings."""
-        count, frames = len(self.impacts), len(self.t)
+        count = len(self.impacts)
+        frames = len(self.t)
         noise = ", ".join(f"{s:.3g}" for s in self.sigma)
         lines = [
-            f"{counted(count, 'impact')} in {frames} frames, {len(self.flights)} flights",
+            (
+                f"{counted(count, 'impact')} in {frames} frames, {len(self.flights)} "
+                f"flights"
+            ),
             f"sigma {noise}",
         ]
         if self.arcs.flight.drag_unknown:
@@ -122,10 +134,14 @@ class Track:
         for k, each in enumerate(self.impacts, 1):
             errors = np.sqrt(np.diag(each.covariance))
             values = [
-                f"{v:.5g} ± {s:.2g}" for v, s in zip([*each.pre, *each.post], errors, strict=True)
+                f"{v:.5g} ± {s:.2g}"
+                for v, s in zip([*each.pre, *each.post], errors, strict=True)
             ]
             n = len(each.pre)
-            doubt = " (doubtful)" if each.doubtful else ""
+            if each.doubtful:
+                doubt = " (doubtful)"
+            else:
+                doubt = ""
             lines.append(
                 f"impact {k} at {each.time:.6g} ± {each.time_error:.2g} s{doubt}: "
                 f"{', '.join(values[:n])} -> {', '.join(values[n:])}"
@@ -137,7 +153,8 @@ class Track:
 
     def plot(self, title: str = "") -> Any:
         """A picture of the track, see `ji.plot.track`."""
-        pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
+        # late: matplotlib takes long to import
+        pictures = import_module("jimpact.plot")
         return pictures.track(self, title)
 
     def experiments(
@@ -151,32 +168,35 @@ class Track:
 
         Impacts that are doubtful are left out, unless `doubtful`.
 
-        With a scene or a body only those stay that its contacts can have made: one approaches, the
-        lowest gap of the body is closed at the pose of the impact, and the change of momentum is
-        one of contacts that push (with any friction), within 5 standard errors or a fifth of it;
-        and in both flights the body is free, not nearer to no acceleration than to a known one. A
-        chain counts coordinates and velocities towards its right end: of bodies that move the other
-        way round, mirror the track (-q, and the bodies in reverse).
+        With a scene or a body only those stay that its contacts can have made: one
+        approaches, the lowest gap of the body is closed at the pose of the impact, and
+        the change of momentum is one of contacts that push (with any friction), within
+        5 standard errors or a fifth of it; and in both flights the body is free, not
+        nearer to no acceleration than to a known one. A chain counts coordinates and
+        velocities towards its right end: of bodies that move the other way round,
+        mirror the track (-q, and the bodies in reverse).
 
-        The scene of a pose counts as known: the covariance has no errors of orientations. Where an
-        angle's error is not small beside the relative errors of velocities (many frames a flight),
-        a fit shows them as lack of fit, and its errors of friction are too small.
+        The scene of a pose counts as known: the covariance has no errors of
+        orientations. Where an angle's error is not small beside the relative errors of
+        velocities (many frames a flight), a fit shows them as lack of fit, and its
+        errors of friction are too small.
 
         Args:
-            scene: of all impacts; a body, which each pose places; None: `fit` is given one, and no
-                impact is left out.
-            near: a contact is closed up to so far above the lowest one, and the lowest one up to so
-                far from 0 [m].
-            label: of the track, before the number of each impact, 'run 3:1'; None: the name of the
-                track, which `read` and studies give it.
-            doubtful: take those impacts, too, that a flight of another acceleration explains.
+            scene: of all impacts; a body, which each pose places; None: `fit` is given
+                one, and no impact is left out.
+            near: a contact is closed up to so far above the lowest one, and the lowest
+                one up to so far from 0 [m].
+            label: of the track, before the number of each impact, 'run 3:1'; None: the
+                name of the track, which `read` and studies give it.
+            doubtful: take those impacts, too, that a flight of another acceleration
+                explains.
 
         Raises:
-            ValueError: no impact, or only doubtful ones, or none that the contacts can have made; a
-            body in space without
-                poses (`quaternion`), or of another inertia than `find_impacts` was given, or whose
-                contacts can have made more of the impacts in the other order of quaternions; as
-                `Body.scenes`.
+            ValueError: no impact, or only doubtful ones, or none that the contacts can
+            have made; a body in space without
+                poses (`quaternion`), or of another inertia than `find_impacts` was
+                given, or whose contacts can have made more of the impacts in the other
+                order of quaternions; as `Body.scenes`.
         """
         if not self.impacts:
             raise ValueError("No impact was found in the track: there are no shots.")
@@ -185,13 +205,17 @@ class Track:
         scenes = None
         if not kept.size:
             raise ValueError(
-                f"All of {counted(len(self.impacts), 'impact')} of the track are doubtful, see "
+                f"All of {counted(len(self.impacts), 'impact')} of the track are "
+                f"doubtful, see "
                 "`warnings`: there are no shots, but with doubtful=True."
             )
         if scene is not None:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
             check_values("near", np.asarray(near, float), low=0.0)
-            body = scene if isinstance(scene, Body) and scene.coordinates is not None else None
+            if isinstance(scene, Body) and scene.coordinates is not None:
+                body = scene
+            else:
+                body = None
             if body is not None:  # in space
                 self._check_inertia(body, near)
             at = _scenes_of(scene, self.impacts, near)
@@ -202,14 +226,23 @@ class Track:
             kept = np.flatnonzero(certain & possible & free)
             if not kept.size:
                 raise ValueError(
-                    "Argument `scene` must be that of an impact of the track, but of none of "
-                    f"{len(self.impacts)} a contact is closed within near = {near:g} m, approaches "
-                    "and can have made the jump, between flights in which the body is free."
+                    "Argument `scene` must be that of an impact of the track, but of "
+                    "none of "
+                    f"{len(self.impacts)} a contact is closed within near = {near:g} "
+                    f"m, approaches "
+                    "and can have made the jump, between flights in which the body is "
+                    "free."
                 )
             scenes = [at[k] for k in kept]
         n = len(self.units)
-        name = self.name if label is None else label
-        before = f"{name}:" if name else ""
+        if label is None:
+            name = self.name
+        else:
+            name = label
+        if name:
+            before = f"{name}:"
+        else:
+            before = ""
         return Experiments(
             [self.impacts[k].pre for k in kept],
             [self.impacts[k].post for k in kept],
@@ -230,32 +263,46 @@ class Track:
         """Raise unless the track has poses, and turns with the inertia of this body."""
         if self.order is None:
             raise ValueError(
-                "Argument `scene` must not be a body in space, whose angular velocity is no rate "
-                "of coordinates: give `find_impacts` poses, places and quaternions (`quaternion`)."
+                "Argument `scene` must not be a body in space, whose angular velocity "
+                "is no rate "
+                "of coordinates: give `find_impacts` poses, places and quaternions "
+                "(`quaternion`)."
             )
         first = body.scenes([self.impacts[0].q], near)[0]
         own = dense_mass(first)[3:, 3:]
-        given = np.eye(3) if self.inertia is None else self.inertia
+        if self.inertia is None:
+            given = np.eye(3)
+            words = "None, as of a sphere"
+        else:
+            given = self.inertia
+            words = str(given.tolist())
         apart = own / np.trace(own) - given / np.trace(given)
         if np.abs(apart).max() > INERTIA_WITHIN:
             raise ValueError(
-                "Argument `scene` must have the `inertia` of `find_impacts`, but has the moments "
-                f"of inertia {own.tolist()}, and `inertia` was "
-                f"{'None, as of a sphere' if self.inertia is None else given.tolist()}: give it "
-                "inertia=body.inertia."
+                "Argument `scene` must have the `inertia` of `find_impacts`, but has "
+                f"the moments of inertia {own.tolist()}, and `inertia` was {words}: "
+                "give it inertia=body.inertia."
             )
 
-    def _check_order(self, body: Body, near: float, scenes: Sequence[Scene | None]) -> None:
-        """Raise where the other order of quaternions explains more impacts than these scenes do."""
+    def _check_order(
+        self, body: Body, near: float, scenes: Sequence[Scene | None]
+    ) -> None:
+        """Raise where the other order of quaternions explains more impacts than these
+        scenes do.
+        """
         if all(scenes) or self.order is None:
             return
         turned = [each.not_in(self.order) for each in self.impacts]
-        here, other = (sum(map(bool, x)) for x in (scenes, _scenes_of(body, turned, near)))
+        here, other = (
+            sum(map(bool, x)) for x in (scenes, _scenes_of(body, turned, near))
+        )
         # a few close a gap by chance, as a cube looks the same from many sides
         if other > 2 * here + 1 or other > here == 0:
             raise ValueError(
-                "Argument `quaternion` of `find_impacts` must name the order of the file, but in "
-                f"the order {self.order!r} {here} of {counted(len(turned), 'impact')} can be of "
+                "Argument `quaternion` of `find_impacts` must name the order of the "
+                "file, but in "
+                f"the order {self.order!r} {here} of {counted(len(turned), 'impact')} "
+                f"can be of "
                 f"this body, in the other one {other}."
             )
 
@@ -275,33 +322,43 @@ def _scenes_of(
         for k, pose in enumerate(poses):
             if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
                 scenes[k] = None
-    return [s if s is not None and _can_be_of(s, i) else None for s, i in zip(scenes, impacts)]
+    return [
+        s if s is not None and _can_be_of(s, i) else None
+        for s, i in zip(scenes, impacts)
+    ]
 
 
 def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:
-    """True if a contact approaches, and contacts that push can have made the jump of velocities.
+    """True if a contact approaches, and contacts that push can have made the jump of
+    velocities.
 
-    Equation: bounded least squares `|A (M^-1 [N, H, C] p - (v+ - v-))|`, normal p >= 0, within
-    OUT_OF_CONE in units of the errors of the jump, or within SHARE_OUT of the jump by energy.
+    Equation: bounded least squares `|A (M^-1 [N, H, C] p - (v+ - v-))|`, normal p >= 0,
+    within OUT_OF_CONE in units of the errors of the jump, or within SHARE_OUT of the
+    jump by energy.
     """
     normals = np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
     speeds = np.abs(normals).T @ np.abs(impact.pre)
     if not (normals.T @ impact.pre < -ROUNDING * speeds).any():
         return False
-    columns, low = [normals], [np.zeros(normals.shape[1])]
+    columns = [normals]
+    low = [np.zeros(normals.shape[1])]
     for other in (scene.tangents, scene.constraints):
         if other is not None:
             columns.append(np.asarray(other, float))
             low.append(np.full(columns[-1].shape[1], -np.inf))
     mass = np.asarray(dense_mass(scene), float)
-    moves, n = np.linalg.solve(mass, np.hstack(columns)), len(impact.pre)
+    moves = np.linalg.solve(mass, np.hstack(columns))
+    n = len(impact.pre)
     signs = np.hstack([-np.eye(n), np.eye(n)])
     errors = np.linalg.inv(np.linalg.cholesky(signs @ impact.covariance @ signs.T))
-    energy, limits = np.linalg.cholesky(mass).T, np.concatenate(low)
+    energy = np.linalg.cholesky(mass).T
+    limits = np.concatenate(low)
     limit = SHARE_OUT * np.linalg.norm(energy @ (impact.post - impact.pre))
     for metric, allowed in ((errors, OUT_OF_CONE), (energy, limit)):
         jump = metric @ (impact.post - impact.pre)
-        rest = lsq_linear(metric @ moves, jump, (limits, np.full(len(limits), np.inf)), "bvls")
+        rest = lsq_linear(
+            metric @ moves, jump, (limits, np.full(len(limits), np.inf)), "bvls"
+        )
         if 2 * rest.cost <= allowed**2:
             return True
     return False

@@ -1,4 +1,6 @@
-"""Free rotation of a body, and the orientation and angular velocity of a flight from its frames."""
+"""Free rotation of a body, and the orientation and angular velocity of a flight from
+its frames.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,8 +9,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-# Turn [rad] and angular velocity [rad/s] of difference quotients: errors are as many parts of a
-# derivative. Ten times more does no harm; ten times less, and rounding counts as much.
+# Turn [rad] and angular velocity [rad/s] of difference quotients: errors are as many
+# parts of a derivative. Ten times more does no harm; ten times less, and rounding
+# counts as much.
 SMALL = 1e-5
 RTOL = 1e-10  # of free rotation, relative; ten times more is still far below noise
 STEPS = 20  # of Gauss-Newton in a flight; 4 are common, and more do not help
@@ -19,8 +22,9 @@ SETTLED = 1e-9  # [rad] of a step; ten times more is still far below noise
 class Turning:
     """Free rotation of a flight: orientation and angular velocity omega in its middle.
 
-    Fields: middle [s]; turn, the orientation; omega (3,) [rad/s] in the axes of the body;
-    covariance (6, 6) of (turn about axes of the body [rad], omega); inertia (3, 3) up to a factor,
+    Fields: middle [s]; turn, the orientation; omega (3,) [rad/s] in the axes of the
+    body; covariance (6, 6) of (turn about axes of the body [rad], omega); inertia (3,
+    3) up to a factor,
     None: that of a sphere.
     """
 
@@ -31,12 +35,18 @@ class Turning:
     inertia: np.ndarray | None
 
     def moved(self, step: np.ndarray) -> "Turning":
-        """Rotation after a change (6,) of turn, about axes of the body [rad], and of omega."""
+        """Rotation after a change (6,) of turn, about axes of the body [rad], and of
+        omega.
+        """
         turn = self.turn * Rotation.from_rotvec(step[:3])
-        return Turning(self.middle, turn, self.omega + step[3:], self.covariance, self.inertia)
+        return Turning(
+            self.middle, turn, self.omega + step[3:], self.covariance, self.inertia
+        )
 
     def rate(self, omega: np.ndarray) -> np.ndarray:
-        """Acceleration `omega' = -I^-1 (omega x I omega)` (3,) [rad/s^2], without torque."""
+        """Acceleration `omega' = -I^-1 (omega x I omega)` (3,) [rad/s^2], without
+        torque.
+        """
         if self.inertia is None:
             return np.zeros(3)
         return -np.linalg.solve(self.inertia, np.cross(omega, self.inertia @ omega))
@@ -44,7 +54,8 @@ class Turning:
     def at(self, times: np.ndarray) -> "TurningAt":
         """Orientations and angular velocities at times (F,) [s], and their derivatives.
 
-        By difference quotients: free rotations from here, and from six starts moved by SMALL.
+        By difference quotients: free rotations from here, and from six starts moved by
+        SMALL.
         """
         starts = [self, *(self.moved(step) for step in SMALL * np.eye(6))]
         turns = Rotation.concatenate([x.turn for x in starts])
@@ -60,11 +71,14 @@ class Turning:
 
 
 class TurningAt(NamedTuple):
-    """A free rotation at F times, and its derivatives in the six values of `Turning.moved`."""
+    """A free rotation at F times, and its derivatives in the six values of
+    `Turning.moved`.
+    """
 
     turn: Rotation  # F orientations
     omega: np.ndarray  # (F, 3) [rad/s]
-    turn_slopes: np.ndarray  # (F, 3, 6) of the turn about the axes of the body at that time
+    # (F, 3, 6) of the turn about the axes of the body at that time
+    turn_slopes: np.ndarray
     omega_slopes: np.ndarray  # (F, 3, 6)
 
 
@@ -73,18 +87,24 @@ def free_rotation(
 ) -> tuple[list[Rotation], np.ndarray]:
     """Free rotations from B starts: F orientations each, and omega (B, F, 3).
 
-    Equation: `R' = R [omega]x`, `I omega' = -omega x I omega` without torque, omega in the axes of
-    the body, at rising times `since` (F,) [s] after the start.
+    Equation: `R' = R [omega]x`, `I omega' = -omega x I omega` without torque, omega in
+    the axes of the body, at rising times `since` (F,) [s] after the start.
     """
     if inertia is None:  # omega stays
-        paths = [r * Rotation.from_rotvec(since[:, None] * w) for r, w in zip(turns, omegas)]
+        paths = [
+            r * Rotation.from_rotvec(since[:, None] * w) for r, w in zip(turns, omegas)
+        ]
         return paths, np.tile(omegas[:, None], (1, len(since), 1))
-    count, inverse = len(omegas), np.linalg.inv(inertia)
+    count = len(omegas)
+    inverse = np.linalg.inv(inertia)
 
     def rates(_: float, state: np.ndarray) -> np.ndarray:
-        """Rates of B states: three rows of R, whose rates are `row x omega`, and omega."""
+        """Rates of B states: three rows of R, whose rates are `row x omega`, and
+        omega.
+        """
         each = state.reshape(count, 4, 3)
-        rows, w = each[:, :3], each[:, 3:]
+        rows = each[:, :3]
+        w = each[:, 3:]
         slope = -np.cross(w, w @ inertia) @ inverse  # both are symmetric
         return np.concatenate([np.cross(rows, w), slope], axis=1).ravel()
 
@@ -95,7 +115,9 @@ def free_rotation(
             # outwards from 0
             order = np.flatnonzero(some)[:: -1 if since[some][0] < 0 else 1]
             span = (0.0, since[order[-1]])
-            path = solve_ivp(rates, span, start, "DOP853", since[order], rtol=RTOL, atol=RTOL)
+            path = solve_ivp(
+                rates, span, start, "DOP853", since[order], rtol=RTOL, atol=RTOL
+            )
             states[order] = path.y.T
     states = states.reshape(len(since), count, 4, 3).swapaxes(0, 1)
     return [Rotation.from_matrix(x[:, :3]) for x in states], states[:, :, 3]
@@ -104,10 +126,11 @@ def free_rotation(
 def fit_turning(
     t: np.ndarray, measured: Rotation, sigma: np.ndarray, inertia: np.ndarray | None
 ) -> tuple[Turning, np.ndarray]:
-    """Free rotation that fits the orientations of a flight, and the residual turns (F, 3) [rad].
+    """Free rotation that fits the orientations of a flight, and the residual turns (F,
+    3) [rad].
 
-    Equation: least squares of `(R(t)^-1 R_measured) / sigma`, as rotation vectors, by Gauss-Newton
-    in turn and omega; covariance `(J^T J)^-1`.
+    Equation: least squares of `(R(t)^-1 R_measured) / sigma`, as rotation vectors, by
+    Gauss-Newton in turn and omega; covariance `(J^T J)^-1`.
 
     Args:
         t: (F,), F >= 2.
@@ -115,9 +138,12 @@ def fit_turning(
         sigma: of turns about the axes of the body (3,).
         inertia: (3, 3), or None.
     """
-    middle, nearest = float(t.mean()), len(t) // 2
+    middle = float(t.mean())
+    nearest = len(t) // 2
     steps = (measured[:-1].inv() * measured[1:]).as_rotvec() / np.diff(t)[:, None]
-    flight = Turning(middle, measured[nearest], np.median(steps, axis=0), np.eye(6), inertia)
+    flight = Turning(
+        middle, measured[nearest], np.median(steps, axis=0), np.eye(6), inertia
+    )
     flight = flight.moved(np.append((middle - t[nearest]) * flight.omega, np.zeros(3)))
     for _ in range(STEPS):
         now = flight.at(t)

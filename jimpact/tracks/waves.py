@@ -1,12 +1,14 @@
 """Errors of places: white ones, and waves beside them.
 
-A table that is not level, a lens, drag that is not known move places slowly beside an arc. Such
-*waves* are errors, too, that neighbouring frames share. In a flight the errors of one coordinate
-have the covariance `C = sigma^2 1 + w^2 k(|t_i - t_j| / T)`, `k(x) = (1 + x) exp(-x)` (Matern, 3/2:
-waves with a velocity, which wander within the time T). Waves of different flights are independent.
+A table that is not level, a lens, drag that is not known move places slowly beside an
+arc. Such *waves* are errors, too, that neighbouring frames share. In a flight the
+errors of one coordinate have the covariance `C = sigma^2 1 + w^2 k(|t_i - t_j| / T)`,
+`k(x) = (1 + x) exp(-x)` (Matern, 3/2: waves with a velocity, which wander within the
+time T). Waves of different flights are independent.
 
-`k` is the covariance of a process of second order, of place f and velocity g: C^-1 of N frames
-takes a banded matrix of 2 N rows (Hartikainen and Saerkkae, MLSP 2010), at any times.
+`k` is the covariance of a process of second order, of place f and velocity g: C^-1 of N
+frames takes a banded matrix of 2 N rows (Hartikainen and Saerkkae, MLSP 2010), at any
+times.
 """
 
 from dataclasses import dataclass
@@ -21,7 +23,9 @@ BANDS = 3  # above the diagonal: (f, g) of a frame and of the next one
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard errors (n,) of each coordinate: white sigma, waves w, and their time T [s]."""
+    """Standard errors (n,) of each coordinate: white sigma, waves w, and their time T
+    [s].
+    """
 
     sigma: np.ndarray
     waves: np.ndarray
@@ -33,15 +37,19 @@ class Errors:
         return cls(sigma, np.zeros_like(sigma), np.ones_like(sigma))
 
     def of(self, c: int, t: np.ndarray, starts: np.ndarray) -> "Covariance":
-        """Covariance of coordinate c in frames t (N,) of flights that begin at `starts` (F,)."""
+        """Covariance of coordinate c in frames t (N,) of flights that begin at `starts`
+        (F,).
+        """
         return Covariance(t, starts, self.sigma[c], self.waves[c], self.times[c])
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance C of the errors of one coordinate in the frames t (N,) of F flights in turn.
+    """Covariance C of the errors of one coordinate in the frames t (N,) of F flights in
+    turn.
 
-    Fields: `starts` (F,), the first frame of each flight; white sigma; waves w; their time T [s].
+    Fields: `starts` (F,), the first frame of each flight; white sigma; waves w; their
+    time T [s].
     """
 
     t: np.ndarray
@@ -65,11 +73,13 @@ class Covariance:
     def log_det(self) -> np.ndarray:
         """`log |C|` (F,) of each flight.
 
-        Equation: `N log sigma^2 + log |P / w^2 + E / sigma^2| - log |P / w^2|`, P the precision of
-        unit (f, g).
+        Equation: `N log sigma^2 + log |P / w^2 + E / sigma^2| - log |P / w^2|`, P the
+        precision of unit (f, g).
         """
         if not self.wave:
-            return np.add.reduceat(np.full(len(self.t), 2 * np.log(self.sigma)), self.starts)
+            return np.add.reduceat(
+                np.full(len(self.t), 2 * np.log(self.sigma)), self.starts
+            )
         white = 4 * np.log(self.wave) - 2 * np.log(self.sigma)
         diagonal = 2 * np.log(self._factor[-1]).reshape(-1, 2).sum(axis=1)
         return np.add.reduceat(white + diagonal + self._steps.log_det, self.starts)
@@ -81,7 +91,9 @@ class Covariance:
 
     @cached_property
     def _factor(self) -> np.ndarray:
-        """Cholesky factor of `sigma^2 P + E`, E the frames seen: upper bands (4, 2 N)."""
+        """Cholesky factor of `sigma^2 P + E`, E the frames seen: upper bands (4, 2
+        N).
+        """
         ratio = (self.sigma / self.wave) ** 2
         bands = ratio * self._steps.bands
         bands[-1, ::2] += 1.0
@@ -90,18 +102,21 @@ class Covariance:
 
 @dataclass(frozen=True)
 class Steps:
-    """Unit waves: bands (4, 2 N) of their precision P, and `log |Q|` (N,) of each step."""
+    """Unit waves: bands (4, 2 N) of their precision P, and `log |Q|` (N,) of each
+    step.
+    """
 
     bands: np.ndarray
     log_det: np.ndarray
 
 
 def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
-    """Precision of (f, g) of unit waves with time T, at frames t (N,) of flights from `starts` on.
+    """Precision of (f, g) of unit waves with time T, at frames t (N,) of flights from
+    `starts` on.
 
-    Equation: over a step of z = dt / T, `(f, g)' = A (f, g) + e`, `A = exp(-z) [[1 + z, z], [-z,
-    1 - z]]`, e of covariance `Q = 1 - A A^T`; f and g, the velocity times T, have variance 1 at
-    the start of a flight.
+    Equation: over a step of z = dt / T, `(f, g)' = A (f, g) + e`,
+    `A = exp(-z) [[1 + z, z], [-z, 1 - z]]`, e of covariance `Q = 1 - A A^T`; f and g,
+    the velocity times T, have variance 1 at the start of a flight.
     """
     z = np.diff(t, prepend=t[0]) / time
     first = np.zeros(len(t), bool)

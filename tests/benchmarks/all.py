@@ -17,13 +17,25 @@ from kernels import compiled
 from rich.console import Console
 
 SCRIPTS = ("three_balls", "peers", "derivatives", "economy", "long_chains", "motions")
-PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy", "numba", "mujoco")
+PACKAGES = (
+    "jimpact",
+    "jax",
+    "jaxlib",
+    "equinox",
+    "diffrax",
+    "numpy",
+    "scipy",
+    "numba",
+    "mujoco",
+)
 
 
 def processor():
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    names = [
+        line.split(":")[1].strip() for line in lines if line.startswith("model name")
+    ]
     return names[0] if names else platform.processor() or "unknown"
 
 
@@ -37,7 +49,9 @@ def version(package):
 def readme(seconds, load, verdicts):
     """What ran, where and when, and what was aimed at beside what was measured."""
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-    rows = "\n".join(f"| `{name}.py` | {taken:.0f} |" for name, taken in seconds.items())
+    rows = "\n".join(
+        f"| `{name}.py` | {taken:.0f} |" for name, taken in seconds.items()
+    )
     return f"""# Benchmark results
 
 Written by `python tests/benchmarks/all.py`; one script alone: `python tests/benchmarks/NAME.py`.
@@ -83,7 +97,9 @@ def main():
         if run.wait() != 0:
             failed.append(name)
     (options.out / "README.md").write_text(readme(seconds, load, verdicts))
-    console.print(f"all: {sum(seconds.values()):.0f} s; written: {options.out / 'README.md'}")
+    console.print(
+        f"all: {sum(seconds.values()):.0f} s; written: {options.out / 'README.md'}"
+    )
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}")
 

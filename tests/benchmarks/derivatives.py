@@ -61,7 +61,9 @@ def jacobian(batch, repeats):
         times = alternating(runs, repeats)
     with stage("Jacobian: error against rtol 1e-12"):
         exact, ours = full(TIGHT)(values), derivative(values)
-        difference = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), ours, exact)
+        difference = jax.tree.map(
+            lambda a, b: float(jnp.max(jnp.abs(a - b))), ours, exact
+        )
         error = max(jax.tree.leaves(difference))
     rows = []
     for name, timing in times.items():
@@ -69,15 +71,30 @@ def jacobian(batch, repeats):
         row["cpu"] = float(np.median(timing.cpu)) / batch * 1e6
         rows.append(row | ({"error_max": error} if "Jacobian" in name else {}))
     last = times["Jacobian (k, e, eta)"]
-    for name, aim in (("value, exponent array", "<= 4"), ("value, exponent static", "")):
-        row = entry(f"Jacobian / {name}", last.wall / times[name].wall, "1", aim, batch=batch)
-        rows.append(row | {"cpu": float(np.median(last.cpu / np.maximum(times[name].cpu, 1e-9)))})
+    for name, aim in (
+        ("value, exponent array", "<= 4"),
+        ("value, exponent static", ""),
+    ):
+        row = entry(
+            f"Jacobian / {name}", last.wall / times[name].wall, "1", aim, batch=batch
+        )
+        rows.append(
+            row
+            | {"cpu": float(np.median(last.cpu / np.maximum(times[name].cpu, 1e-9)))}
+        )
     return rows
 
 
 def entry(quantity, values, unit, aim="", **more):
     low, middle, high = quartiles(values)
-    row = {"quantity": quantity, "q1": low, "median": middle, "q3": high, "unit": unit, "aim": aim}
+    row = {
+        "quantity": quantity,
+        "q1": low,
+        "median": middle,
+        "q3": high,
+        "unit": unit,
+        "aim": aim,
+    }
     return row | more
 
 
@@ -97,14 +114,18 @@ def single(points, repeats, settings):
         return (V + velocity_change(SCENE, result.impulse)) @ weight
 
     k, e = jnp.asarray(stiffness), jnp.asarray(restitution)
-    gradient = jax.jit(jax.vmap(jax.grad(at_any_rtol, argnums=(0, 1)), in_axes=(0, 0, None)))
+    gradient = jax.jit(
+        jax.vmap(jax.grad(at_any_rtol, argnums=(0, 1)), in_axes=(0, 0, None))
+    )
     with stage("single impact with gradient: tuning"):
         exact = jnp.concatenate(gradient(k, e, TRUTH), axis=1)
 
         def error_of(parts):
             return float(jnp.max(jnp.abs(jnp.concatenate(parts, axis=1) - exact)))
 
-        rtol, _ = loosest(lambda r: error_of(gradient(k, e, r)), settings, GRADIENT_ERROR)
+        rtol, _ = loosest(
+            lambda r: error_of(gradient(k, e, r)), settings, GRADIENT_ERROR
+        )
         with_gradient = solver(rtol)
         pairs = list(zip(k, e))
         gradients = [with_gradient(*pair)[1] for pair in pairs]
@@ -116,7 +137,9 @@ def single(points, repeats, settings):
         ("single impact", value, ""),
         ("single impact with gradient", with_gradient, "<= 2"),
     ):
-        seconds = [timed(lambda p=p, f=run: f(*p))[0] for _ in range(repeats) for p in pairs]
+        seconds = [
+            timed(lambda p=p, f=run: f(*p))[0] for _ in range(repeats) for p in pairs
+        ]
         row = entry(name, np.asarray(seconds) * 1e3, "ms", aim, setting=rtol, batch=1)
         rows.append(row | ({"error_max": error} if aim else {}))
     return rows
@@ -144,7 +167,9 @@ def compilation(repeats):
         with stage(f"compiling {name} in processes of their own"):
             command = [sys.executable, __file__, "--compile", name]
             outs = [
-                subprocess.run(command, capture_output=True, text=True, check=True).stdout
+                subprocess.run(
+                    command, capture_output=True, text=True, check=True
+                ).stdout
                 for _ in range(repeats)
             ]
         seconds = [float(out.split()[-1]) for out in outs]
@@ -175,7 +200,11 @@ def chart(rows, path):
         axes.barh([row["quantity"] for row in part], middle, xerr=spread, capsize=3)
         for place, row in enumerate(part):
             if row["aim"]:
-                axes.plot([float(row["aim"].split()[-1])] * 2, [place - 0.4, place + 0.4], "k--")
+                axes.plot(
+                    [float(row["aim"].split()[-1])] * 2,
+                    [place - 0.4, place + 0.4],
+                    "k--",
+                )
         axes.set_xlabel(label)
         axes.invert_yaxis()
     figure.suptitle("Derivatives and compilation; dashed: aim", fontsize=10)

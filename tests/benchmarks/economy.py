@@ -9,7 +9,16 @@ should cost the same (what is not asked for costs nothing) the aim is 1.
 import functools
 from unittest import mock
 
-from harness import alternating, arguments, quartiles, save_figure, show, stage, timed, write_csv
+from harness import (
+    alternating,
+    arguments,
+    quartiles,
+    save_figure,
+    show,
+    stage,
+    timed,
+    write_csv,
+)
 
 import jax  # isort: skip
 import jax.numpy as jnp
@@ -68,7 +77,12 @@ def open_contacts():
     everything = batched(dense(31), struck(31))
     k, wide = stiffnesses(FEW, 3), stiffnesses(FEW, 30)
     return [
-        ("30 contacts: 3 closed / all closed", lambda: part(wide), lambda: everything(wide), "> 1"),
+        (
+            "30 contacts: 3 closed / all closed",
+            lambda: part(wide),
+            lambda: everything(wide),
+            "> 1",
+        ),
         ("3 contacts / 3 closed of 30", lambda: alone(k), lambda: part(wide), "1"),
     ]
 
@@ -82,7 +96,10 @@ def beside(balls, count):
 
 def independent_pairs(batch, pairs):
     """`pairs` pairs of balls in one scene; the same as single pairs in a batch."""
-    together, single = batched(*beside(2, pairs)), batched(ji.chain(jnp.ones(2)), struck(2))
+    together, single = (
+        batched(*beside(2, pairs)),
+        batched(ji.chain(jnp.ones(2)), struck(2)),
+    )
     coupled = batched(dense(pairs + 1), struck(pairs + 1))
     k = stiffnesses(batch, pairs)
     each = k.reshape(-1, 1)
@@ -108,7 +125,9 @@ def by_groups(balls, count):
     def both(name, make):
         scene, v = beside(balls, count)
         k = stiffnesses(FEW, scene.contacts)
-        run = jax.vmap(lambda k, s: ji.impact(make(k), s, v).velocity, in_axes=(0, None))
+        run = jax.vmap(
+            lambda k, s: ji.impact(make(k), s, v).velocity, in_axes=(0, None)
+        )
         apart, whole = jax.jit(lambda k: run(k, scene)), jax.jit(run)
         np.testing.assert_allclose(apart(k), whole(k, scene), atol=1e-6)
         row = f"{count} chains of {balls}, {name}: by groups / whole"
@@ -137,7 +156,12 @@ def isolated_contact(batch):
     run = batched(ji.chain(jnp.ones(3)), struck(3))
     whole = compiled_without_closed_form(run, k)
     return [
-        ("3 balls: closed form / integrated to the end", lambda: run(k), lambda: whole(k), "> 1")
+        (
+            "3 balls: closed form / integrated to the end",
+            lambda: run(k),
+            lambda: whole(k),
+            "> 1",
+        )
     ]
 
 
@@ -167,9 +191,19 @@ def single_contact(batch):
 
 
 def tridiagonal(n):
-    chain, matrix = batched(ji.chain(jnp.ones(n)), struck(n)), batched(dense(n), struck(n))
+    chain, matrix = (
+        batched(ji.chain(jnp.ones(n)), struck(n)),
+        batched(dense(n), struck(n)),
+    )
     k = jnp.ones((1, n - 1))
-    return [(f"chain of {n}: tridiagonal / dense", lambda: chain(k), lambda: matrix(k), "> 1")]
+    return [
+        (
+            f"chain of {n}: tridiagonal / dense",
+            lambda: chain(k),
+            lambda: matrix(k),
+            "> 1",
+        )
+    ]
 
 
 def not_asked_for(batch):
@@ -178,19 +212,44 @@ def not_asked_for(batch):
     plain = batched(scene, v)
     touching = batched(ji.chain(jnp.ones(3), gaps=jnp.zeros(2)), v)
     rough = ji.Scene(jnp.ones(3), scene.normals, tangents=jnp.zeros((3, 2)))
-    smooth, tangents = batched(ji.Scene(jnp.ones(3), scene.normals), v), batched(rough, v)
+    smooth, tangents = (
+        batched(ji.Scene(jnp.ones(3), scene.normals), v),
+        batched(rough, v),
+    )
 
     def forced(force):
-        return jax.jit(jax.vmap(lambda k: ji.impact(ji.Compliant(force(k)), scene, v).velocity))
+        return jax.jit(
+            jax.vmap(lambda k: ji.impact(ji.Compliant(force(k)), scene, v).velocity)
+        )
 
     spring, damper = forced(ji.Hertz), forced(lambda k: ji.HuntCrossley(k, 0.0))
     sampled = jax.jit(jax.vmap(lambda k: ji.history(ji.LZB(E, k, 1.5), scene, v).force))
     return [
         ("gaps: none / all zero", lambda: plain(k), lambda: touching(k), "1"),
-        ("tangents: none / there, no friction", lambda: smooth(k), lambda: tangents(k), "1"),
-        ("LZB / Compliant, the same outcome at e = 1", lambda: plain(k), lambda: spring(k), "> 1"),
-        ("damping: none / zero Hunt-Crossley", lambda: spring(k), lambda: damper(k), "> 1"),
-        ("impact / history of 200 samples", lambda: plain(k), lambda: sampled(k), "> 1"),
+        (
+            "tangents: none / there, no friction",
+            lambda: smooth(k),
+            lambda: tangents(k),
+            "1",
+        ),
+        (
+            "LZB / Compliant, the same outcome at e = 1",
+            lambda: plain(k),
+            lambda: spring(k),
+            "> 1",
+        ),
+        (
+            "damping: none / zero Hunt-Crossley",
+            lambda: spring(k),
+            lambda: damper(k),
+            "> 1",
+        ),
+        (
+            "impact / history of 200 samples",
+            lambda: plain(k),
+            lambda: sampled(k),
+            "> 1",
+        ),
     ]
 
 
@@ -200,12 +259,19 @@ def compared(cases, repeats):
         with stage(name):
             timed(full)
             fitting = int(LONGEST / timed(full)[0])
-            times = alternating({"lean": lean, "full": full}, min(repeats, max(2, fitting)))
+            times = alternating(
+                {"lean": lean, "full": full}, min(repeats, max(2, fitting))
+            )
         low, middle, high = quartiles(times["full"].wall / times["lean"].wall)
         by_cpu = np.median(times["full"].cpu) / max(np.median(times["lean"].cpu), 1e-9)
         milliseconds = {k: float(np.median(t.wall)) * 1e3 for k, t in times.items()}
         row = {"lean / full": name} | {f"{k}_ms": v for k, v in milliseconds.items()}
-        row |= {"saving_q1": low, "saving": middle, "saving_q3": high, "saving_cpu": float(by_cpu)}
+        row |= {
+            "saving_q1": low,
+            "saving": middle,
+            "saving_q3": high,
+            "saving_cpu": float(by_cpu),
+        }
         rows.append(row | {"aim": aim})
     return rows
 
@@ -216,14 +282,18 @@ def chart(rows, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(8, 0.4 * len(rows) + 1.2), layout="constrained")
+    figure, axes = plt.subplots(
+        figsize=(8, 0.4 * len(rows) + 1.2), layout="constrained"
+    )
     middle = np.array([row["saving"] for row in rows])
     spread = [
         middle - [row["saving_q1"] for row in rows],
         np.array([row["saving_q3"] for row in rows]) - middle,
     ]
     colours = ["C2" if row["aim"] == "1" else "C0" for row in rows]
-    axes.errorbar(middle, range(len(rows)), xerr=spread, fmt="none", color="k", capsize=3)
+    axes.errorbar(
+        middle, range(len(rows)), xerr=spread, fmt="none", color="k", capsize=3
+    )
     axes.scatter(middle, range(len(rows)), color=colours, zorder=3)
     axes.set_yticks(range(len(rows)), [row["lean / full"] for row in rows])
     axes.axvline(1.0, color="k", lw=0.5)

@@ -47,7 +47,10 @@ def measure(row):
     more, faster = ji.chain([1.0] * 4), jnp.array([1.0, 0.0, 0.0, 0.0])
     block = ji.Block(1.0, 2.0, corners="base").scene()
     shots = ji.Experiments(pre=[[1.0, 0, 0]], post=[[-0.0605, 0.1049, 0.9978]])
-    five, before = ji.chain([1.0, 1.2, 0.8, 1.1, 0.9], wall="right"), jnp.eye(5)[:4]  # [m/s]
+    five, before = (
+        ji.chain([1.0, 1.2, 0.8, 1.1, 0.9], wall="right"),
+        jnp.eye(5)[:4],
+    )  # [m/s]
     after = [  # of LZB([0.9, 0.8, 0.85, 0.95, 0.7])
         [-0.40955, -0.13153, -0.12876, -0.1089, -0.01543],
         [-0.47155, -0.1287, -0.11991, -0.08727, -0.01935],
@@ -69,10 +72,16 @@ def measure(row):
     first = {
         "diffrax": lambda: run(jnp.ones((1, 2)), e[None], 1e-8),
         "impact": lambda: ji.impact(ji.LZB(0.9), balls, v).velocity,
-        "another number of balls": lambda: ji.impact(ji.LZB(0.9), more, faster).velocity,
-        "Jacobian": lambda: jax.jacfwd(lambda e: ji.impact(ji.LZB(e), balls, v).velocity)(e),
+        "another number of balls": lambda: (
+            ji.impact(ji.LZB(0.9), more, faster).velocity
+        ),
+        "Jacobian": lambda: jax.jacfwd(
+            lambda e: ji.impact(ji.LZB(e), balls, v).velocity
+        )(e),
         "friction": lambda: ji.impact(ji.LZB(0.9, friction=0.3), block, v).velocity,
-        "fit": lambda: ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution,
+        "fit": lambda: (
+            ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution
+        ),
         "fit of five parameters": lambda: (
             ji.fit(
                 ji.LZB([0.8] * 5),
@@ -82,8 +91,12 @@ def measure(row):
             ).value
         ),
         "motion": lambda: ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0).q,
-        "two blocks": lambda: ji.simulate(two, ji.Moreau(0.3), falling, [0.0] * 6, 0.5).q,
-        "motion with friction": lambda: ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0).q,
+        "two blocks": lambda: (
+            ji.simulate(two, ji.Moreau(0.3), falling, [0.0] * 6, 0.5).q
+        ),
+        "motion with friction": lambda: (
+            ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0).q
+        ),
     }[row]
     begun = cpu()
     jax.block_until_ready(first())
@@ -95,7 +108,9 @@ def main(repeats=3):
     for _ in range(repeats):
         for row in TARGETS:
             command = [sys.executable, __file__, "--row", row]
-            out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+            out = subprocess.run(
+                command, capture_output=True, text=True, check=True
+            ).stdout
             times[row].append(float(out.split()[-1]))
     unit = statistics.median(times["diffrax"])
     for row, target in TARGETS.items():

@@ -22,8 +22,26 @@ from jimpact.fits.solve import Solver, minimize
 PROBLEMS, SIGMA = 40, 0.01
 LAWS = ("lzb", "lzb", "lzb", "compliant", "moreau", "matrix")
 COLUMNS = (
-    *("problem", "law", "balls", "wall", "shots", "free", "chi2", "chi2_scipy", "from_truth"),
-    *("minima", "lost", "evaluations", "evaluations_scipy", "cpu", "cpu_first", "cpu_scipy"),
+    *(
+        "problem",
+        "law",
+        "balls",
+        "wall",
+        "shots",
+        "free",
+        "chi2",
+        "chi2_scipy",
+        "from_truth",
+    ),
+    *(
+        "minima",
+        "lost",
+        "evaluations",
+        "evaluations_scipy",
+        "cpu",
+        "cpu_first",
+        "cpu_scipy",
+    ),
 )
 
 
@@ -85,7 +103,9 @@ def by_scipy(start, scene, data, free, truth):
             point = np.zeros((1, len(fitted.low)))
             point[0, : len(y)] = y
             everything = np.ones(point.shape, bool)
-            ends = minimize([fitted.least_squares()], point, Solver(max_steps=1), fixed=everything)
+            ends = minimize(
+                [fitted.least_squares()], point, Solver(max_steps=1), fixed=everything
+            )
             known[y.tobytes()] = ends.residual[0], ends.jacobian[0, :, : len(y)]
         return known[y.tobytes()]
 
@@ -94,7 +114,9 @@ def by_scipy(start, scene, data, free, truth):
     at(first)
     began = time.process_time()
     scale = "jac" if fitted.matrix is None else 1.0
-    found = least_squares(lambda y: at(y)[0], first, lambda y: at(y)[1], (low, high), x_scale=scale)
+    found = least_squares(
+        lambda y: at(y)[0], first, lambda y: at(y)[1], (low, high), x_scale=scale
+    )
     return 2 * found.cost, found.nfev, time.process_time() - began
 
 
@@ -143,7 +165,9 @@ def main():
         rows.append(row(k))
         print(
             *(
-                f"{rows[-1][key]:.5g}" if isinstance(rows[-1][key], float) else rows[-1][key]
+                f"{rows[-1][key]:.5g}"
+                if isinstance(rows[-1][key], float)
+                else rows[-1][key]
                 for key in COLUMNS
             ),
             flush=True,

@@ -34,8 +34,12 @@ def laws():
     runs = {}
     for name, scene in (("block", block), ("rod", rod)):
         runs[name, "none"] = lambda v, mu, s=scene: ji.impact(ji.LZB(E), s, v)
-        runs[name, "LZB"] = lambda v, mu, s=scene: ji.impact(ji.LZB(E, friction=mu), s, v)
-    runs["block", "Moreau"] = lambda v, mu: ji.impact(ji.Moreau(E, friction=mu), block, v)
+        runs[name, "LZB"] = lambda v, mu, s=scene: ji.impact(
+            ji.LZB(E, friction=mu), s, v
+        )
+    runs["block", "Moreau"] = lambda v, mu: ji.impact(
+        ji.Moreau(E, friction=mu), block, v
+    )
     return runs
 
 
@@ -44,13 +48,29 @@ def main():
     batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if options.quick else (BATCH, REPEATS)
     v, mu = inputs(batch)
     programs = {key: jax.jit(jax.vmap(law)) for key, law in laws().items()}
-    timings = alternating({key: lambda f=f: f(v, mu) for key, f in programs.items()}, repeats)
+    timings = alternating(
+        {key: lambda f=f: f(v, mu) for key, f in programs.items()}, repeats
+    )
     rows = []
     for (scene, law), timing in timings.items():
-        failed = int((np.asarray(programs[scene, law](v, mu).status) >= CODE["energy_gain"]).sum())
+        failed = int(
+            (
+                np.asarray(programs[scene, law](v, mu).status) >= CODE["energy_gain"]
+            ).sum()
+        )
         row = {"scene": scene, "friction": law, "failed": failed}
         rows.append(row | columns(timing, batch, timings[scene, "none"]))
-    keys = ("scene", "friction", "us", "us_q1", "us_q3", "ratio_q1", "ratio", "ratio_q3", "failed")
+    keys = (
+        "scene",
+        "friction",
+        "us",
+        "us_q1",
+        "us_q3",
+        "ratio_q1",
+        "ratio",
+        "ratio_q3",
+        "failed",
+    )
     show(f"Cost of friction, {batch} impacts, ratio to the frictionless", rows, keys)
     write_csv(options.out / "friction.csv", rows)
 

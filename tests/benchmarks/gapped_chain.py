@@ -92,7 +92,9 @@ def ours(rtol):
         mesh = jax.make_mesh((len(jax.devices()),), ("core",))
         along = jax.sharding.PartitionSpec("core")
         sharding = jax.sharding.NamedSharding(mesh, along)
-        run = jax.shard_map(shard, mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
+        run = jax.shard_map(
+            shard, mesh=mesh, in_specs=along, out_specs=along, check_vma=False
+        )
         compiled = jax.jit(run)
         return lambda g: compiled(jax.device_put(g, sharding))
 
@@ -138,7 +140,9 @@ def main():
     print(f"{os.cpu_count()} cores, batch {BATCH}, load {os.getloadavg()[0]:.1f}")
     print("measure  target               setting    error µs/impact  ratio  first s")
     for measure, target in (("rms", 1e-5), ("rms", 1e-7), ("max", 1e-5), ("max", 1e-7)):
-        rtol, e_ours = tuned(lambda r: made[r][0](on_device), exact, made, target, measure)
+        rtol, e_ours = tuned(
+            lambda r: made[r][0](on_device), exact, made, target, measure
+        )
         steps = [0.2 / 2 ** (p / 2) for p in range(30)]
         h, e_verlet = tuned(lambda h: verlet(gaps, h), exact, steps, target, measure)
         value, jacobian = made[rtol]

@@ -9,6 +9,7 @@ the batches.
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from harness import arguments, quartiles, show, stage, timed, write_csv
@@ -25,7 +26,16 @@ LARGEST_JACOBIAN = 1 << 20
 CHECKED = 256  # impacts of a batch that are compared with the finest tolerance
 FINEST = 1e-13
 
-COLUMNS = ("name", "precision", "batch", "first_s", "ns_each", "error", "failed", "device")
+COLUMNS = (
+    "name",
+    "precision",
+    "batch",
+    "first_s",
+    "ns_each",
+    "error",
+    "failed",
+    "device",
+)
 
 
 def row(
@@ -47,7 +57,9 @@ def row(
         failures = jnp.asarray([status.failure for status in ji.STATUS])
         entries["failed"] = int(failures[out[1]].sum())
         if exact is not None:
-            entries["error"] = float(np.abs(np.asarray(out[0][:CHECKED], float) - exact).max())
+            entries["error"] = float(
+                np.abs(np.asarray(out[0][:CHECKED], float) - exact).max()
+            )
     return entries
 
 
@@ -63,7 +75,11 @@ def stiffnesses(batch: int, contacts: int, dtype: str) -> jax.Array:
 
 
 def chain_rows(
-    name: str, scene: ji.Scene, make: Callable[..., Any], batches: list[int], derivative: bool
+    name: str,
+    scene: ji.Scene,
+    make: Callable[..., Any],
+    batches: list[int],
+    derivative: bool,
 ) -> Iterator[dict[str, Any]]:
     """A chain that its first ball strikes: values in both precisions, Jacobians in double."""
     count = scene.contacts
@@ -129,7 +145,9 @@ def dense(largest: int) -> Iterator[dict[str, Any]]:
         "Newton": lambda e: ji.Newton(e),
         "Moreau": lambda e: ji.Moreau(e),
         "Binary": lambda e: ji.Binary(e),
-        "RestitutionMatrix": lambda e: ji.RestitutionMatrix(e * jnp.eye(3, dtype=e.dtype)),
+        "RestitutionMatrix": lambda e: ji.RestitutionMatrix(
+            e * jnp.eye(3, dtype=e.dtype)
+        ),
         "LZB": lambda e: ji.LZB(e, jnp.ones(3, e.dtype), 1.5),
     }
 
@@ -148,18 +166,33 @@ def dense(largest: int) -> Iterator[dict[str, Any]]:
         for precision in ("float64", "float32"):
             run, at = impacts(make, precision)
             reference = np.asarray(found[:CHECKED])
-            yield row(f"dense body, {name}", precision, len(v), lambda: run(at), reference)  # noqa: B023
+            yield row(
+                f"dense body, {name}", precision, len(v), partial(run, at), reference
+            )
 
 
 def boxes(largest: int) -> Iterator[dict[str, Any]]:
     """A box that falls flat on its four corners, without and with friction, at random velocities."""
     batches = sizes(largest, 1 << 12, 1 << 16)
     scene = ji.Box([0.2, 0.3, 0.1]).scene([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0])
-    v = np.random.default_rng(1).normal(size=(batches[-1], 6)) * 0.1 + [0, 0, -1.0, 0, 0, 0]
+    v = np.random.default_rng(1).normal(size=(batches[-1], 6)) * 0.1 + [
+        0,
+        0,
+        -1.0,
+        0,
+        0,
+        0,
+    ]
     laws = {
         "box on four corners, LZB(.8)": (ji.LZB(0.8, 1.0, 1.5), 1 << 16),
-        "box on four corners, Moreau(.5, mu=.3)": (ji.Moreau(0.5, friction=0.3), 1 << 12),
-        "box on four corners, LZB(.8, mu=.3)": (ji.LZB(0.8, 1.0, 1.5, friction=0.3), 1 << 12),
+        "box on four corners, Moreau(.5, mu=.3)": (
+            ji.Moreau(0.5, friction=0.3),
+            1 << 12,
+        ),
+        "box on four corners, LZB(.8, mu=.3)": (
+            ji.LZB(0.8, 1.0, 1.5, friction=0.3),
+            1 << 12,
+        ),
     }
     for name, (law, most) in laws.items():
 
@@ -196,14 +229,18 @@ def fits(largest: int) -> Iterator[dict[str, Any]]:
     pre = np.zeros((12, 3))
     pre[:, 0] = rng.uniform(0.5, 1.5, 12)
     pre[:, 2] = -rng.uniform(0.0, 1.0, 12)
-    exact = jax.vmap(lambda v: ji.impact(ji.LZB(0.9, [1.0, 3.0], 1.5), scene, v).velocity)(pre)
+    exact = jax.vmap(
+        lambda v: ji.impact(ji.LZB(0.9, [1.0, 3.0], 1.5), scene, v).velocity
+    )(pre)
     start = ji.LZB(0.8, [1.0, 1.0], 1.5)
     for sets in sizes(largest // 16, 64, 1024, 8192):
         post = np.asarray(exact) + 0.01 * rng.normal(size=(sets, 12, 3))
         data = [ji.Experiments(pre, each, sigma=0.01) for each in post]
 
         def run(data: list[Any] = data) -> Any:
-            return ji.fit_many(start, scene, data, free=("restitution", "stiffness")).value
+            return ji.fit_many(
+                start, scene, data, free=("restitution", "stiffness")
+            ).value
 
         yield row("fits of 12 shots, LZB", "float64", sets, run)
 
@@ -215,13 +252,17 @@ def motions(largest: int) -> Iterator[dict[str, Any]]:
 
     def rock(tilt: jax.Array) -> Any:
         q = block.touching(tilt)
-        motion = ji.simulate(system, law, q, jnp.zeros(3), 0.5, samples=3, max_events=100)
+        motion = ji.simulate(
+            system, law, q, jnp.zeros(3), 0.5, samples=3, max_events=100
+        )
         return motion.q[-1], motion.status
 
     run = jax.jit(jax.vmap(rock))
     for batch in sizes(largest, 1 << 10, 1 << 14):
         tilts = jnp.linspace(0.05, 0.25, batch)
-        yield row("rocking blocks, .5 s", "float64", batch, lambda tilts=tilts: run(tilts))
+        yield row(
+            "rocking blocks, .5 s", "float64", batch, lambda tilts=tilts: run(tilts)
+        )
 
 
 PARTS = {
@@ -238,8 +279,12 @@ def main() -> None:
     """Print the table, part by part, and write it."""
 
     def add(parser: Any) -> None:
-        parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="default: all")
-        parser.add_argument("--largest", type=int, default=LARGEST, help="impacts of a batch")
+        parser.add_argument(
+            "parts", nargs="*", choices=[*PARTS, []], help="default: all"
+        )
+        parser.add_argument(
+            "--largest", type=int, default=LARGEST, help="impacts of a batch"
+        )
 
     options = arguments(__doc__, add)
     largest = 1 << 6 if options.quick else options.largest

@@ -41,8 +41,12 @@ def arguments(
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     if add is not None:
         add(parser)
-    parser.add_argument("--quick", action="store_true", help="tiny batches: only whether it runs")
-    parser.add_argument("--out", type=Path, default=None, help=f"folder; default {RESULTS.name}/")
+    parser.add_argument(
+        "--quick", action="store_true", help="tiny batches: only whether it runs"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=None, help=f"folder; default {RESULTS.name}/"
+    )
     options = parser.parse_args()
     if options.out is None:
         options.out = Path("jimpact-out") if options.quick else RESULTS
@@ -133,7 +137,9 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer = csv.DictWriter(file, [*keys, *stamp], lineterminator="\n")
         writer.writeheader()
         for row in rows:
-            kept = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+            kept = {
+                k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()
+            }
             writer.writerow(kept | stamp)
     print(f"written: {path}")
 

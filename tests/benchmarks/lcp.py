@@ -83,11 +83,15 @@ def main():
                 continue
             cost, first = timed(jax.jit(jax.vmap(solver)), w, q)
             z = jax.jit(jax.vmap(solver))(w, q)
-            worst = -float(jnp.minimum(z.min(), (jnp.einsum("kij,kj->ki", w, z) + q).min()))
+            worst = -float(
+                jnp.minimum(z.min(), (jnp.einsum("kij,kj->ki", w, z) + q).min())
+            )
             slope = np.nan
             if name != "qpax":  # it has no forward mode
                 jvp = jax.jit(
-                    jax.vmap(lambda w, q, f=solver: jax.jvp(lambda b: f(w, b), (q,), (q,))[1])
+                    jax.vmap(
+                        lambda w, q, f=solver: jax.jvp(lambda b: f(w, b), (q,), (q,))[1]
+                    )
                 )
                 slope, _ = timed(jvp, w, q)
             ours = ours or cost

@@ -97,7 +97,9 @@ def expected(rows, n):
     steepness = STEEP
     if len(rows) > 1:
         a, b = rows[-2], rows[-1]
-        steepness = max(1.0, np.log(b["seconds"] / a["seconds"]) / np.log(b["N"] / a["N"]))
+        steepness = max(
+            1.0, np.log(b["seconds"] / a["seconds"]) / np.log(b["N"] / a["N"])
+        )
     return rows[-1]["seconds"] * (n / rows[-1]["N"]) ** steepness
 
 
@@ -107,7 +109,9 @@ def all_lengths(lengths):
         left = min(LIMIT, BUDGET - (time.perf_counter() - begun))
         wanted = [e for e in RESTITUTIONS if expected(kept[e], n) <= left]
         for e in sorted(set(RESTITUTIONS) - set(wanted)):
-            expectation = f"about {expected(kept[e], n):.0f} s an impact, {left:.0f} s left"
+            expectation = (
+                f"about {expected(kept[e], n):.0f} s an impact, {left:.0f} s left"
+            )
             print(f"skipped: N = {n}, e = {e}: {expectation}")
         if not wanted:
             continue
@@ -121,10 +125,14 @@ def all_lengths(lengths):
 
 def exponent_of(rows, key):
     """Slope of log(key) against log(N) of the impacts that ended; NaN with fewer than two."""
-    long = [row for row in rows if row["N"] >= FIT_FROM and row["status"] != "max_steps"]
+    long = [
+        row for row in rows if row["N"] >= FIT_FROM and row["status"] != "max_steps"
+    ]
     if len(long) < 2:
         return float("nan")
-    return float(np.polyfit(np.log([r["N"] for r in long]), np.log([r[key] for r in long]), 1)[0])
+    return float(
+        np.polyfit(np.log([r["N"] for r in long]), np.log([r[key] for r in long]), 1)[0]
+    )
 
 
 def chart(kept, path):
@@ -134,7 +142,11 @@ def chart(kept, path):
     import matplotlib.pyplot as plt
 
     figure, all_axes = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
-    labels = {"seconds": "time of one impact [s]", "passes": "passes", "memory_MB": "memory [MB]"}
+    labels = {
+        "seconds": "time of one impact [s]",
+        "passes": "passes",
+        "memory_MB": "memory [MB]",
+    }
     for axes, (key, label) in zip(all_axes, labels.items()):
         for e, rows in kept.items():
             slope = exponent_of(rows, key)
@@ -152,7 +164,9 @@ def main():
     kept = all_lengths((4, 8) if options.quick else LENGTHS)
     rows = []
     for e, part in kept.items():
-        slopes = {f"{key}_exponent": exponent_of(part, key) for key in ("seconds", "passes")}
+        slopes = {
+            f"{key}_exponent": exponent_of(part, key) for key in ("seconds", "passes")
+        }
         rows += [row | slopes for row in part]
         aim = f"; aim: <= {AIMS[e]}" if e in AIMS else ""
         print(
@@ -160,7 +174,9 @@ def main():
             f"passes ~ N^{slopes['passes_exponent']:.2f}, memory ~ "
             f"N^{exponent_of(part, 'memory_MB'):.2f} (N >= {FIT_FROM})"
         )
-    keys = "e N seconds_q1 seconds seconds_q3 passes us_per_pass loaded memory_MB status"
+    keys = (
+        "e N seconds_q1 seconds seconds_q3 passes us_per_pass loaded memory_MB status"
+    )
     show("one Hertz chain, struck at its end", rows, keys.split())
     write_csv(options.out / "long_chains.csv", rows)
     chart(kept, options.out / "long_chains.png")

@@ -31,16 +31,26 @@ def measured(name):
     gaps = None if "LZB" in name else ji.Uniform(0.0, 50e-6)  # [m]
     stiffness = ji.Uniform(0.5e10, 2e10)
     law = {
-        "LZB, random stiffness": ji.RandomLaw(ji.LZB(0.9, [1e10, 1e10]), stiffness=stiffness),
+        "LZB, random stiffness": ji.RandomLaw(
+            ji.LZB(0.9, [1e10, 1e10]), stiffness=stiffness
+        ),
         **dict.fromkeys(ROWS[3:], ji.Compliant(ji.Hertz(1e10))),
     }.get(name, ji.Binary(0.9, "earliest"))
     samples = dict(zip(ROWS[2:], (200_000, 1_000_000, 150_000))).get(name, 4_000_000)
-    run = partial(ji.monte_carlo, law, scene, strike, gaps=gaps, samples=samples, progress=False)
+    run = partial(
+        ji.monte_carlo, law, scene, strike, gaps=gaps, samples=samples, progress=False
+    )
     begun, worked = time.perf_counter(), time.process_time()
     result = run(chunk=16384) if "chunk" in name else run()
     wall, cpu = time.perf_counter() - begun, time.process_time() - worked
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    row = {"law": name, "samples": samples, "rate": result.rate, "s": wall, "cpu_s": cpu}
+    row = {
+        "law": name,
+        "samples": samples,
+        "rate": result.rate,
+        "s": wall,
+        "cpu_s": cpu,
+    }
     return row | {"memory_MB": memory}
 
 

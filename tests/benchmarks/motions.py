@@ -48,7 +48,8 @@ def main():
         events[name, "one"] = events[name, "gradient"] = int(single(one).events.count)
     timings = alternating(runs, repeats)
     rows = [
-        {"motion": key[0], "what": key[1], "events": events[key]} | columns(timing, events[key])
+        {"motion": key[0], "what": key[1], "events": events[key]}
+        | columns(timing, events[key])
         for key, timing in timings.items()
     ]
     show(

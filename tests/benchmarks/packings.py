@@ -24,21 +24,33 @@ import numpy as np
 from harness import show, write_csv
 
 LAWS = ("moreau", "poisson", "lzb", "lzb implicit", "compliant", "mujoco")
-TOUCHING = 0.72  # part of the spheres that is not smaller: 2.5 contacts a sphere at 1000
+TOUCHING = (
+    0.72  # part of the spheres that is not smaller: 2.5 contacts a sphere at 1000
+)
 SMALLER = 0.9
 REPEATS = 2
 COARSE = 1e-4  # rtol of the steps without events
-MODELS = ("cradle", "box on an edge", "biped", "arm with a ball", "double pendulum (URDF)")
+MODELS = (
+    "cradle",
+    "box on an edge",
+    "biped",
+    "arm with a ball",
+    "double pendulum (URDF)",
+)
 
 
 def packing(count, seed=0):
     """Centres (k, 3) and radii (k,); the last one strikes from above."""
     cells = np.arange(int(np.ceil((count / 4) ** (1 / 3))))
-    corners = np.stack(np.meshgrid(cells, cells, cells, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    corners = np.stack(
+        np.meshgrid(cells, cells, cells, indexing="ij"), axis=-1
+    ).reshape(-1, 1, 3)
     base = np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
     at = np.sqrt(2) * (corners + base).reshape(-1, 3)
     at = at[np.argsort(at[:, 2], kind="stable")][: count - 1]
-    radii = np.where(np.random.default_rng(seed).random(count - 1) < TOUCHING, 0.5, 0.5 * SMALLER)
+    radii = np.where(
+        np.random.default_rng(seed).random(count - 1) < TOUCHING, 0.5, 0.5 * SMALLER
+    )
     middle = at.mean(axis=0)
     # the sphere that is hit: among those that touch others, the one nearest to the middle of the top
     apart = np.linalg.norm(at[:, None] - at[None], axis=2)
@@ -67,7 +79,11 @@ def spheres_in_mujoco(at, radii, dimensions=3, floor=False):
     if dimensions == 2:
         joints = "".join(
             f'<joint type="{kind}" axis="{axis}"/>'
-            for kind, axis in (("slide", "1 0 0"), ("slide", "0 0 1"), ("hinge", "0 1 0"))
+            for kind, axis in (
+                ("slide", "1 0 0"),
+                ("slide", "0 0 1"),
+                ("hinge", "0 1 0"),
+            )
         )
     bodies = "".join(
         f'<body pos="{x} {y} {z}">{joints}<geom size="{r}" mass="1"/></body>'
@@ -98,7 +114,12 @@ def impact_in_mujoco(count):
         return data
 
     first, later, data = timed(run)
-    return {"contacts": data.ncon, "first_s": first, "later_s": later, "status": "a step"}
+    return {
+        "contacts": data.ncon,
+        "first_s": first,
+        "later_s": later,
+        "status": "a step",
+    }
 
 
 def impact_of(name, count):
@@ -117,7 +138,9 @@ def impact_of(name, count):
         "compliant": ji.Compliant(force, method="implicit", rtol=COARSE),
     }[name]
     at, radii = packing(count)
-    spheres = ji.Bodies([ji.Sphere(r) for r in radii], (), room=7 * count)  # as many have
+    spheres = ji.Bodies(
+        [ji.Sphere(r) for r in radii], (), room=7 * count
+    )  # as many have
     scene = spheres.closed_scene(spheres.at(at))
     v = np.zeros(6 * count)
     v[-4] = -1.0
@@ -150,15 +173,22 @@ def steps_of(dimensions, count, steps=100, step=1e-3, mixed=False):
     import jimpact as ji
 
     at = grid(count, dimensions)
-    kind, floor = (ji.Sphere, [0, 0, 1.0, -0.5]) if dimensions == 3 else (ji.Disc, [0, 1.0, -0.5])
-    shapes = [ji.Disc(0.5), ji.Block(np.sqrt(0.5), np.sqrt(0.5))] if mixed else [kind(0.5)]
+    kind, floor = (
+        (ji.Sphere, [0, 0, 1.0, -0.5]) if dimensions == 3 else (ji.Disc, [0, 1.0, -0.5])
+    )
+    shapes = (
+        [ji.Disc(0.5), ji.Block(np.sqrt(0.5), np.sqrt(0.5))] if mixed else [kind(0.5)]
+    )
     body = ji.Bodies(
         [shapes[i % len(shapes)] for i in range(count)],
         [floor],
         room=(4, 7)[dimensions - 2] * count,
     )
     system = ji.System(body, gravity=9.81)
-    law, start = ji.Moreau(0.3, friction=0.5), body.at(at[:, :3] if dimensions == 3 else at[:, ::2])
+    law, start = (
+        ji.Moreau(0.3, friction=0.5),
+        body.at(at[:, :3] if dimensions == 3 else at[:, ::2]),
+    )
 
     def run():
         """A fall."""
@@ -173,7 +203,9 @@ def steps_of(dimensions, count, steps=100, step=1e-3, mixed=False):
         "first_s": first,
         "later_s": later / steps,
         "status": ji.STATUS[int(motion.status)].name,
-        "lowest": float(np.asarray(motion.q[-1]).reshape(count, -1)[:, dimensions - 1].min()),
+        "lowest": float(
+            np.asarray(motion.q[-1]).reshape(count, -1)[:, dimensions - 1].min()
+        ),
     }
 
 
@@ -194,7 +226,12 @@ def steps_in_mujoco(dimensions, count, steps=100, step=1e-3):
 
     first, later, data = timed(run)
     lowest = data.xpos[1:, 2].min()
-    return {"first_s": first, "later_s": later / steps, "status": "", "lowest": float(lowest)}
+    return {
+        "first_s": first,
+        "later_s": later / steps,
+        "status": "",
+        "lowest": float(lowest),
+    }
 
 
 FLOOR = '<geom name="floor" type="plane" size="9 9 1" friction=".5"/>'
@@ -242,7 +279,9 @@ def model_of(name):
     }[name]
     xml = f"<mujoco><worldbody>{text}</worldbody></mujoco>"
     if not text:  # two pendulums side by side whose ends touch
-        links = LINK.format("left", "base", "0 0 0") + LINK.format("lower", "left", "0 0 -.6")
+        links = LINK.format("left", "base", "0 0 0") + LINK.format(
+            "lower", "left", "0 0 -.6"
+        )
         xml = URDF.format(links + LINK.format("right", "base", ".1 0 0"))
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
@@ -266,7 +305,9 @@ def model_row(name, _count):
     moreau = ji.Moreau(0.5, friction=friction)
     velocity = world.velocity
     impact = timed(lambda: jax.block_until_ready(ji.impact(law, world.scene, velocity)))
-    quick = timed(lambda: jax.block_until_ready(ji.impact(moreau, world.scene, velocity)))
+    quick = timed(
+        lambda: jax.block_until_ready(ji.impact(moreau, world.scene, velocity))
+    )
     return {
         "velocities": world.scene.size,
         "contacts": world.scene.contacts,
@@ -295,7 +336,13 @@ ENTRIES = {
 }
 NAMES = {
     "impacts": LAWS,
-    "steps": ("discs", "discs, MuJoCo", "discs and squares", "spheres", "spheres, MuJoCo"),
+    "steps": (
+        "discs",
+        "discs, MuJoCo",
+        "discs and squares",
+        "spheres",
+        "spheres, MuJoCo",
+    ),
     "models": MODELS,
 }
 
@@ -306,7 +353,9 @@ def main():
     parser.add_argument("kind", choices=ENTRIES)
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 100, 1000, 3000])
     parser.add_argument("--names", nargs="+", default=None)
-    parser.add_argument("--limit", type=float, default=600.0, help="seconds of one entry")
+    parser.add_argument(
+        "--limit", type=float, default=600.0, help="seconds of one entry"
+    )
     parser.add_argument("--entry", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     names = options.names or NAMES[options.kind]
@@ -318,7 +367,14 @@ def main():
     rows = []
     for name in names:
         for count in options.counts if options.kind != "models" else [0]:
-            command = [sys.executable, __file__, options.kind, "--entry", "--names", name]
+            command = [
+                sys.executable,
+                __file__,
+                options.kind,
+                "--entry",
+                "--names",
+                name,
+            ]
             command += ["--counts", str(count)]
             row = {"name": name} | ({"count": count} if count else {})
             try:

@@ -41,9 +41,7 @@ def model_of(balls, wall, options):
     )
     if wall:
         place = 2 * RADIUS * balls - RADIUS
-        bodies += (
-            f"<geom name='g{balls}' type='plane' size='1 1 1' pos='{place} 0 0' zaxis='-1 0 0'/>"
-        )
+        bodies += f"<geom name='g{balls}' type='plane' size='1 1 1' pos='{place} 0 0' zaxis='-1 0 0'/>"
     pairs = "".join(
         f"<pair geom1='g{j}' geom2='g{j + 1}' condim='1' {options}/>"
         for j in range(balls - 1 + wall)
@@ -61,7 +59,9 @@ def by_mujoco(options, law, scene, velocity, _setting):
     v, wall = np.asarray(velocity, float), bool(scene.walls[1])
     model = model_of(len(v), wall, options)
     if options == SPRINGS:
-        model.pair_solref[:] = np.stack([-STIFF * np.asarray(law.stiffness), 0 * law.stiffness], 1)
+        model.pair_solref[:] = np.stack(
+            [-STIFF * np.asarray(law.stiffness), 0 * law.stiffness], 1
+        )
     state = mujoco.MjData(model)
     state.qvel[:] = v
     for _ in range(STEPS // 10):
@@ -123,7 +123,12 @@ def picture(rows):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(
-        1, len(SCENES), figsize=(11, 4.6), sharex=True, sharey=True, layout="constrained"
+        1,
+        len(SCENES),
+        figsize=(11, 4.6),
+        sharex=True,
+        sharey=True,
+        layout="constrained",
     )
     colours, markers = (
         itertools.cycle(f"C{i}" for i in (0, 1, 2, 3, 4, 5, 6, 8, 9)),
@@ -134,7 +139,11 @@ def picture(rows):
         for method in dict.fromkeys(row["method"] for row in rows):
             points = [r for r in rows if (r["scene"], r["method"]) == (scene, method)]
             if method not in styles and points[0]["setting"] is None:
-                styles[method] = {"color": "0.45", "marker": next(markers), "linestyle": "none"}
+                styles[method] = {
+                    "color": "0.45",
+                    "marker": next(markers),
+                    "linestyle": "none",
+                }
             elif method not in styles:
                 styles[method] = {"color": next(colours), "marker": "o"}
             times = [1e6 * row["alone_s"] for row in points]
@@ -143,7 +152,9 @@ def picture(rows):
         panel.set_title(scene)
         panel.set_xlabel("time of one impact [µs]")
     axes[0].set_ylabel("error of v+")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=7)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=7
+    )
     return figure
 
 

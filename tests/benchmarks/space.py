@@ -42,12 +42,24 @@ RESTARTS = 3  # of a family of impacts, after one that did not end
 BATCH, REPEATS, LEAST = 256, 7, 0.2  # impacts; calls, and seconds of them, for a median
 METHODS = ("exact", "implicit", "moreau")
 TASKS = ("value", "jacobian", "second", "gradient")
-WANTED = {"value": 4.0, "jacobian": 8.0, "second": 20.0}  # first calls, in units of diffrax
+WANTED = {
+    "value": 4.0,
+    "jacobian": 8.0,
+    "second": 20.0,
+}  # first calls, in units of diffrax
 ROBUST = 1.5  # first value of the implicit method
 SCENES = (*spatial_scenes.NAMED, "plane, 2 contacts")
 CUBES = {"cube corner": 1, "cube edge": 2, "cube flat": 4}
 HELD = Path(__file__).parent.parent / "held" / "friction_space.npz"
-INPUTS = ("mass", "normals", "tangents", "velocity", "restitution", "friction", "stiffness")
+INPUTS = (
+    "mass",
+    "normals",
+    "tangents",
+    "velocity",
+    "restitution",
+    "friction",
+    "stiffness",
+)
 SHARP = 1e-3  # slopes are compared where lower differences agree to this: no kink in between
 KINDS = (*spatial_scenes.KINDS, *CUBES)
 
@@ -137,7 +149,12 @@ def without_cache():
 def entry(*row):
     """What a child prints of a row; `status` says why nothing came."""
     command = [sys.executable, __file__, "--row", *row]
-    options = {"capture_output": True, "text": True, "env": without_cache(), "preexec_fn": limited}
+    options = {
+        "capture_output": True,
+        "text": True,
+        "env": without_cache(),
+        "preexec_fn": limited,
+    }
     try:
         done = subprocess.run(command, timeout=WALL * LIMIT, **options)
     except subprocess.TimeoutExpired:
@@ -169,7 +186,16 @@ def first_calls(options):
                 row["wanted"] = ROBUST if robust else WANTED.get(task)
                 rows.append(row)
                 print(row, file=sys.stderr, flush=True)
-    keys = ("scene", "method", "task", "first_s", "ratio", "wanted", "then_ms", "status")
+    keys = (
+        "scene",
+        "method",
+        "task",
+        "first_s",
+        "ratio",
+        "wanted",
+        "then_ms",
+        "status",
+    )
     show("First call in a fresh process [CPU s], ratio to diffrax; then", rows, keys)
     write_csv(options.out / "space.csv", rows)
 
@@ -191,7 +217,9 @@ def draw_of(kind, count):
     mass = [np.diag(s.mass) if s.mass.ndim == 1 else s.mass for s in scenes]
     parts = (mass, [s.normals for s in scenes], [s.tangents for s in scenes])
     velocity = np.asarray(shots.pre)[each]
-    return spatial_scenes.Draw(*map(np.stack, parts), velocity, np.full(len(mu), 0.27), mu)
+    return spatial_scenes.Draw(
+        *map(np.stack, parts), velocity, np.full(len(mu), 0.27), mu
+    )
 
 
 def program_of(method):
@@ -278,7 +306,9 @@ def impact_row(method, kind, count):
     mu = draw_of(kind, count).friction[: len(status)]
     failed = np.array([s < 0 or STATUS[s].failure for s in status])
     names = Counter("none" if s < 0 else STATUS[s].name for s in status)
-    batch = child("--batch", method, kind, str(min(count, 4 * BATCH)), seconds=WALL * LIMIT)
+    batch = child(
+        "--batch", method, kind, str(min(count, 4 * BATCH)), seconds=WALL * LIMIT
+    )
     mean, worst = map(float, batch[-1].split()) if batch else (np.nan, np.nan)
     return {
         "kind": kind,
@@ -328,7 +358,9 @@ def agree(method, contacts):
         def after(change):
             factor = jnp.ones_like(k).at[0].set(jnp.exp(change[2]))
             out = ji.impact(
-                law(e + change[1], mu + change[0], stiffness=k * factor), scene, velocity
+                law(e + change[1], mu + change[0], stiffness=k * factor),
+                scene,
+                velocity,
             )
             return out.velocity, (out.velocity, out.status)
 
@@ -340,7 +372,9 @@ def agree(method, contacts):
     error = np.abs(v - held["after"]).max(axis=1)[ends]
     wrong = np.abs(slopes - held["slopes"]).max(axis=2)
     names = Counter(ji.STATUS[int(s)].name for s in status)
-    known = (np.nan_to_num(held["slope_uncertainty"], nan=np.inf) < SHARP) & ends[:, None]
+    known = (np.nan_to_num(held["slope_uncertainty"], nan=np.inf) < SHARP) & ends[
+        :, None
+    ]
     row = {"impacts": len(status), "error": np.median(error), "worst": error.max()}
     for i, name in enumerate(("mu", "e", "k")):
         at = wrong[known[:, i], i]
@@ -354,12 +388,23 @@ def agreement(options):
     """The table of errors."""
     rows = []
     for contacts in ("1", "2", "4"):
-        for method in (m for m in options.methods if m != "moreau" and laws(m) is not None):
+        for method in (
+            m for m in options.methods if m != "moreau" and laws(m) is not None
+        ):
             said = child("--agree", method, contacts, seconds=WALL * LIMIT)
             found = json.loads(said[-1]) if said else {"statuses": "none"}
             rows.append({"contacts": contacts, "method": method} | found)
             print(rows[-1], file=sys.stderr, flush=True)
-    keys = ("contacts", "method", "impacts", "error", "worst", "slope_mu", "worst_mu", "slope_e")
+    keys = (
+        "contacts",
+        "method",
+        "impacts",
+        "error",
+        "worst",
+        "slope_mu",
+        "worst_mu",
+        "slope_e",
+    )
     keys = (*keys, "worst_e", "slope_k", "worst_k", "statuses")
     show("Difference from an independent integration", rows, keys)
     write_csv(options.out / "space_agreement.csv", rows)
@@ -368,7 +413,9 @@ def agreement(options):
 def add_options(parser):
     """The choices of the tables."""
     parser.add_argument("--agreement", action="store_true", help="the table of errors")
-    parser.add_argument("--impacts", type=int, default=0, help="so many impacts, not the table")
+    parser.add_argument(
+        "--impacts", type=int, default=0, help="so many impacts, not the table"
+    )
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
@@ -390,7 +437,11 @@ def main():
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--row"]:
         row = sys.argv[2:]
-        found = {"first_s": first_call.measure("diffrax")} if row == ["diffrax"] else measure(*row)
+        found = (
+            {"first_s": first_call.measure("diffrax")}
+            if row == ["diffrax"]
+            else measure(*row)
+        )
         print(json.dumps(found))
     elif sys.argv[1:2] == ["--each"]:
         solve_each(*sys.argv[2:])

@@ -30,7 +30,15 @@ EXPONENT = 1.5
 EPS, EPS_OF_SLOPES = 1e-6, 1e-7  # over the fastest approach
 RTOL = 1e-10
 STEP = 1e-3  # of the differences, in mu, e and ln k
-INPUTS = ("mass", "normals", "tangents", "velocity", "restitution", "friction", "stiffness")
+INPUTS = (
+    "mass",
+    "normals",
+    "tangents",
+    "velocity",
+    "restitution",
+    "friction",
+    "stiffness",
+)
 OUTPUTS = ("after", "uncertainty", "slopes", "slope_uncertainty")
 
 
@@ -43,7 +51,9 @@ def impacts(contacts):
             e, mu = RESTITUTIONS[i % len(RESTITUTIONS)], FRICTIONS[i % len(FRICTIONS)]
             rows.append((*pressed, e, mu, 2.0 ** rng.uniform(-1, 1, contacts)))
     if contacts <= 2:
-        for *pressed, e, mu in list(zip(*spatial_scenes.cube_draw(contacts)))[: 4 * CUBES : 4]:
+        for *pressed, e, mu in list(zip(*spatial_scenes.cube_draw(contacts)))[
+            : 4 * CUBES : 4
+        ]:
             rows.append((*pressed, e, mu, np.ones(contacts)))
     return rows
 

@@ -67,18 +67,23 @@ def build(folder):
 
     def written(name, rows):
         rows = np.atleast_2d(rows)
-        text = ",".join("{" + ",".join(f"{x!r}L" for x in map(float, row)) + "}" for row in rows)
+        text = ",".join(
+            "{" + ",".join(f"{x!r}L" for x in map(float, row)) + "}" for row in rows
+        )
         shape = f"[{len(rows)}][{stages}]" if len(rows) > 1 else f"[{stages}]"
         return f"const long double {name}{shape} = {'{' + text + '}' if len(rows) > 1 else text};\n"
 
     d = dop853_coefficients
     text = f"const int STAGES = {stages};\n" + written("A", d.A[:stages, :stages])
-    text += written("B", d.B) + written("E3", d.E3[:stages]) + written("E5", d.E5[:stages])
+    text += (
+        written("B", d.B) + written("E3", d.E3[:stages]) + written("E5", d.E5[:stages])
+    )
     (folder / "dop853.h").write_text(text)
     program = folder / "oracle"
     source = str(HERE / "lzb_oracle.cpp")
     subprocess.run(
-        ["g++", "-O3", "-std=c++17", f"-I{folder}", source, "-o", str(program)], check=True
+        ["g++", "-O3", "-std=c++17", f"-I{folder}", source, "-o", str(program)],
+        check=True,
     )
     return program
 
@@ -102,7 +107,9 @@ def main():
     uncertainty, end = np.full(POINTS, np.nan), np.full(POINTS, 2)
     if DATA.exists() and np.array_equal(np.load(DATA)["points"], chosen):
         held = np.load(DATA)
-        velocity, uncertainty, end = (held[name] for name in ("velocity", "uncertainty", "end"))
+        velocity, uncertainty, end = (
+            held[name] for name in ("velocity", "uncertainty", "end")
+        )
     missing = sorted(np.flatnonzero(end == 2), key=lambda i: chosen[i, 4])
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
         program = build(Path(folder))

@@ -34,7 +34,12 @@ from jimpact.numerics.tableaux import DOP853
 BATCH, CHUNK, REPEATS = 4096, 256, 11
 TRUTH, FINE, COARSE = 1e-13, 3e-8, 1e-6
 AT_MOST = {"C++": 1.5}  # aims: jimpact / C++ at most, the others / jimpact at least
-AT_LEAST = {"diffrax Dopri8": 20.0, "numba RK4": 3.0, "numba Verlet": 3.0, "Siconos": 1000.0}
+AT_LEAST = {
+    "diffrax Dopri8": 20.0,
+    "numba RK4": 3.0,
+    "numba Verlet": 3.0,
+    "Siconos": 1000.0,
+}
 
 
 SCENE, V = ji.chain(jnp.ones(3)), jnp.array([1.0, 0.0, 0.0])
@@ -58,7 +63,9 @@ def one_impact(k, e, rtol):
 def at_any_rtol(k, e, rtol):
     """The same v+ and the passes of the integrator, compiled once for all tolerances."""
     result = aligned(law_of(k, e), SCENE, V, rtol)
-    return V + velocity_change(SCENE, result.impulse), result.evaluations / len(DOP853.c)
+    return V + velocity_change(SCENE, result.impulse), result.evaluations / len(
+        DOP853.c
+    )
 
 
 def jimpact(rtol, chunk=None):
@@ -66,7 +73,9 @@ def jimpact(rtol, chunk=None):
     one = partial(one_impact, rtol=rtol)
     if chunk is None:
         return jax.jit(jax.vmap(one))
-    return jax.jit(lambda k, e: jax.lax.map(lambda x: one(*x), (k, e), batch_size=chunk))
+    return jax.jit(
+        lambda k, e: jax.lax.map(lambda x: one(*x), (k, e), batch_size=chunk)
+    )
 
 
 def steps(first, last, per_decade):
@@ -174,7 +183,9 @@ def verdicts(rows):
         spread = [row.get(key, ratio) for key in ("ratio_q1", "ratio_q3")]
         if name in AT_MOST and row["target"] == FINE:
             spread = f"{1 / spread[1]:.1f} .. {1 / spread[0]:.1f}"
-            print(f"jimpact / {name}: {1 / ratio:.2f} ({spread}); aim: <= {AT_MOST[name]}")
+            print(
+                f"jimpact / {name}: {1 / ratio:.2f} ({spread}); aim: <= {AT_MOST[name]}"
+            )
         elif name in AT_LEAST:
             spread = f"{spread[0]:.1f} .. {spread[1]:.1f}"
             print(f"{name} / jimpact: {ratio:.1f} ({spread}); aim: >= {AT_LEAST[name]}")
@@ -186,12 +197,19 @@ def chart(rows, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(8, 0.42 * len(rows) + 1.2), layout="constrained")
+    figure, axes = plt.subplots(
+        figsize=(8, 0.42 * len(rows) + 1.2), layout="constrained"
+    )
     labels = [f"{row['method']} at {row['error_max']:.0e}" for row in rows]
     middle = np.array([row["us"] for row in rows])
-    low, high = (np.array([row.get(key, row["us"]) for row in rows]) for key in ("us_q1", "us_q3"))
+    low, high = (
+        np.array([row.get(key, row["us"]) for row in rows])
+        for key in ("us_q1", "us_q3")
+    )
     colours = ["C0" if row["method"].startswith("jimpact") else "C7" for row in rows]
-    axes.barh(labels, middle, xerr=[middle - low, high - middle], color=colours, capsize=3)
+    axes.barh(
+        labels, middle, xerr=[middle - low, high - middle], color=colours, capsize=3
+    )
     for place, value in enumerate(middle):
         axes.annotate(f" {value:.3g}", (value, place), va="center", xytext=(8, 0), textcoords="offset points")  # fmt: skip
     axes.set_xscale("log")
@@ -199,7 +217,8 @@ def chart(rows, path):
     axes.invert_yaxis()
     axes.set_xlabel("time per impact [us], median and quartiles")
     axes.set_title(
-        "Three Hertz balls, LZB, e = 0.9: largest error of v+ over the batch", fontsize=10
+        "Three Hertz balls, LZB, e = 0.9: largest error of v+ over the batch",
+        fontsize=10,
     )
     save_figure(figure, path)
 
@@ -211,8 +230,14 @@ def main():
     rows = measured(rows_of(bench), batch, repeats)
     rows = with_siconos(rows, bench, options.quick)
     rows = [{"batch": batch, **row} for row in rows]
-    keys = "method target setting error_max passes us_q1 us us_q3 cpu_us ratio ratio_cpu"
-    show(f"{batch} three-ball impacts, ratios to jimpact at the same target", rows, keys.split())
+    keys = (
+        "method target setting error_max passes us_q1 us us_q3 cpu_us ratio ratio_cpu"
+    )
+    show(
+        f"{batch} three-ball impacts, ratios to jimpact at the same target",
+        rows,
+        keys.split(),
+    )
     verdicts(rows)
     write_csv(options.out / "three_balls.csv", rows)
     chart(rows, options.out / "three_balls.png")

@@ -14,7 +14,9 @@ CUBE_CSV = Path(__file__).parents[1] / "held" / "cube_impacts.csv"
 CUBE_MASS, CUBE_INERTIA = 0.37, (9.57e-4, 9.57e-4, 9.09e-4)  # kg, kg m^2
 CUBE_HALF, CUBE_CENTRE, CUBE_LOW = 0.0474, 0.0057, 0.0036  # m
 CUBE_MU = (0.16, 0.3, 0.6)
-CORNERS = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
+CORNERS = np.array(
+    [[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)]
+)
 
 
 class Pressed(NamedTuple):
@@ -135,7 +137,9 @@ def random_boxes(kind, count, seed=0):
     rows = []
     while len(rows) < count:
         velocity = rng.normal(size=6) * [1, 1, 0.3, 2, 2, 2] - [0, 0, 1, 0, 0, 0]
-        pressed = box(rng.uniform(0.2, 1.0, 3), random_turn(kind, rng), CONTACTS[kind], velocity)
+        pressed = box(
+            rng.uniform(0.2, 1.0, 3), random_turn(kind, rng), CONTACTS[kind], velocity
+        )
         if (pressed.normals.T @ velocity).min() < -0.1:
             rows.append(pressed)
     e = with_ends(rng.uniform(size=count), rng)

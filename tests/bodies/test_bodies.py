@@ -29,7 +29,9 @@ def test_a_block_keeps_all_its_corners():
     np.testing.assert_allclose(scene.gaps, lever[:, 1] - lever[:, 1].min(), atol=1e-15)
     ones = np.ones(4)
     np.testing.assert_allclose(scene.normals, [0 * ones, ones, lever[:, 0]], atol=1e-15)
-    np.testing.assert_allclose(scene.tangents, [ones, 0 * ones, -lever[:, 1]], atol=1e-15)
+    np.testing.assert_allclose(
+        scene.tangents, [ones, 0 * ones, -lever[:, 1]], atol=1e-15
+    )
     side = block.touching(np.pi / 2)
     assert side[1] == pytest.approx(width / 2, abs=1e-15)
     assert np.asarray(block.scene(side).closed).tolist() == [False, True, True, False]
@@ -41,12 +43,16 @@ def test_two_corners_have_a_range():
     assert block.gap_function(block.touching()).shape == (2,)
     assert float(block.valid(block.touching(0.3))) > 0
     fallen = jnp.array([0.0, 0.45, np.pi / 2])
-    with pytest.raises(ValueError, match=r"`q` must be in the range.*corners='all'.*-0\.05"):
+    with pytest.raises(
+        ValueError, match=r"`q` must be in the range.*corners='all'.*-0\.05"
+    ):
         block.scene(fallen)
 
     @jax.jit
     def lands(q):
-        return ji.impact(ji.Newton(0.5), block.scene(q), jnp.array([0.0, -1.0, 0.0])).status
+        return ji.impact(
+            ji.Newton(0.5), block.scene(q), jnp.array([0.0, -1.0, 0.0])
+        ).status
 
     reported = [ji.STATUS[int(lands(q))].name for q in (block.touching(), fallen)]
     assert reported == ["ok", "not_finite"]
@@ -59,15 +65,23 @@ def test_polygons_find_their_centre_of_mass():
     far = ji.Polygon(turned(corners, 2.0, (300.0, -70.0)), mass=2.0)
     back = ji.Polygon(corners[::-1], mass=2.0)
     for body in (far, back):
-        assert float(body.inertia) == pytest.approx(2 * np.sum(sides**2) / 36, rel=1e-11)
-    np.testing.assert_allclose(back.corners, (corners - corners.mean(axis=0))[::-1], atol=1e-15)
+        assert float(body.inertia) == pytest.approx(
+            2 * np.sum(sides**2) / 36, rel=1e-11
+        )
+    np.testing.assert_allclose(
+        back.corners, (corners - corners.mean(axis=0))[::-1], atol=1e-15
+    )
     given = ji.Polygon(corners, inertia=0.3, centre=[0.5, 0.1])
     np.testing.assert_allclose(given.corners, corners - [0.5, 0.1], atol=1e-15)
     block, q = ji.Block(1.5, 2.0, 3.0), [0.1, 1.7, 0.4]
     same = ji.Polygon(block.corners, mass=3.0).scene(q)
-    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(block.scene(q)), strict=True):
+    for a, b in zip(
+        jax.tree.leaves(same), jax.tree.leaves(block.scene(q)), strict=True
+    ):
         np.testing.assert_allclose(a, b, atol=1e-14)
-    slope = jax.grad(lambda x: ji.Polygon(jnp.array(corners) * x, mass=2.0).inertia)(1.0)
+    slope = jax.grad(lambda x: ji.Polygon(jnp.array(corners) * x, mass=2.0).inertia)(
+        1.0
+    )
     assert float(slope) == pytest.approx(2 * float(back.inertia), rel=1e-12)
 
 
@@ -111,9 +125,16 @@ def distance(first, second):
         side = np.roll(other, -1, axis=0) - other
         for p in points:
             arm = p - other
-            if len(other) > 2 and np.all(side[:, 0] * arm[:, 1] > side[:, 1] * arm[:, 0]):
+            if len(other) > 2 and np.all(
+                side[:, 0] * arm[:, 1] > side[:, 1] * arm[:, 0]
+            ):
                 return None
-    ends = [(p, a, b) for points, c in ways for p in points for a, b in zip(c, np.roll(c, -1, 0))]
+    ends = [
+        (p, a, b)
+        for points, c in ways
+        for p in points
+        for a, b in zip(c, np.roll(c, -1, 0))
+    ]
     return min(segment(p, a, b) for p, a, b in ends if np.any(a != b))
 
 
@@ -149,12 +170,21 @@ def test_gaps_are_distances(heap):
         at = turned(triangle, x[2, 2], x[2, :2])
         middle = x[4, :2] - turned([[0.05, 0.02]], x[4, 2])[0]
         boxes = [
-            turned(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(s) / 2, a[2], a[:2])
+            turned(
+                np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(s) / 2,
+                a[2],
+                a[:2],
+            )
             for s, a in zip(SIZES.values(), x)
         ]
         gaps = found.gap[i, kinds]
-        assert gaps[0] == pytest.approx(np.linalg.norm(x[3, :2] - middle) - 0.45, abs=1e-14)
-        for gap, disc, r, polygon in ((1, x[3, :2], 0.2, at), (2, middle, 0.25, boxes[0])):
+        assert gaps[0] == pytest.approx(
+            np.linalg.norm(x[3, :2] - middle) - 0.45, abs=1e-14
+        )
+        for gap, disc, r, polygon in (
+            (1, x[3, :2], 0.2, at),
+            (2, middle, 0.25, boxes[0]),
+        ):
             away = distance(disc[None], polygon)
             if away is not None:
                 assert gaps[gap] == pytest.approx(away - r, abs=1e-14)
@@ -177,7 +207,9 @@ def test_forces_act_at_the_contacts(heap):
         middle, n = q[i].reshape(-1, 3)[:, :2], found.normal[i]
         np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-14)
         along = np.stack([n[:, 1], -n[:, 0]], axis=1)
-        expected = [wrenches(body.between, middle, d, found.point[i]) for d in (n, along)]
+        expected = [
+            wrenches(body.between, middle, d, found.point[i]) for d in (n, along)
+        ]
         np.testing.assert_allclose(slopes[i].T, expected[0], atol=1e-13)
         np.testing.assert_allclose(tangents[i], expected[1], atol=1e-13)
 
@@ -186,7 +218,10 @@ def test_a_block_on_a_slope():
     angle = 0.3
     slope = ji.Bodies([ji.Block(0.2, 0.1, mass=2.0)], [(angle, 0.4)])
     q = slope.touching(along=0.7)
-    along, up = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    along, up = (
+        np.array([np.cos(angle), np.sin(angle)]),
+        np.array([-np.sin(angle), np.cos(angle)]),
+    )
     np.testing.assert_allclose(q[:2], 0.7 * along + 0.45 * up, atol=1e-15)
     scene = slope.scene(q)
     np.testing.assert_allclose(scene.gaps, [0, 0, 0.1, 0.1], atol=1e-15)
@@ -206,14 +241,18 @@ def test_facing_sides_may_part():
     # the lower block's right end bears, and the upper one's left end
     levers = np.sort(np.abs(np.asarray(scene.normals)[[2, 5]][:, -2:]), axis=1)
     np.testing.assert_allclose(levers, [[0.2, 0.5], [0.2, 0.5]], atol=1e-15)
-    off = np.array([0.0, 0.5, 0.0, 1.2, 1.5, 0.0])  # it has slid off: corner from corner
+    off = np.array(
+        [0.0, 0.5, 0.0, 1.2, 1.5, 0.0]
+    )  # it has slid off: corner from corner
     np.testing.assert_allclose(np.min(stack.scene(off).gaps[-2:]), 0.2, atol=1e-15)
     off[4] = 0.6  # beside the other one
     np.testing.assert_allclose(np.min(stack.scene(off).gaps[-2:]), 0.2, atol=1e-15)
 
 
 def segment_distance(point, begin, end):
-    share = np.clip((point - begin) @ (end - begin) / ((end - begin) @ (end - begin)), 0, 1)
+    share = np.clip(
+        (point - begin) @ (end - begin) / ((end - begin) @ (end - begin)), 0, 1
+    )
     return np.linalg.norm(point - begin - share * (end - begin))
 
 
@@ -230,7 +269,10 @@ def polygon_distance(a, b):
 def separation(a, b):
     """The largest distance of the corners of b beyond the line of a side of a."""
     side = np.roll(a, -1, axis=0) - a
-    normals = np.stack([side[:, 1], -side[:, 0]], axis=1) / np.linalg.norm(side, axis=1)[:, None]
+    normals = (
+        np.stack([side[:, 1], -side[:, 0]], axis=1)
+        / np.linalg.norm(side, axis=1)[:, None]
+    )
     return max(min((b - x) @ n) for x, n in zip(a, normals))
 
 
@@ -281,7 +323,9 @@ def corner_on_side(shapes, below, above, path):
     corner has changed.
     """
     begin, end = np.asarray(shapes[below].points)[0, :2]
-    slope = np.arctan2(*(end - begin)[::-1]) - np.pi / 2  # of its normal, in its own axes
+    slope = (
+        np.arctan2(*(end - begin)[::-1]) - np.pi / 2
+    )  # of its normal, in its own axes
     rows, corners = [], []
     for way, angle in path:
         own = turned(np.asarray(shapes[above].corners), angle)
@@ -302,10 +346,18 @@ def test_contacts_of_odd_polygons_keep_their_places(polygons):
     for below, above, column, begin, end in (
         (2, 3, 2, [0.1, 0.2], [14.0, -9.0]),  # both odd: any way around each other
         (3, 2, 2, [0.1, 0.2], [-14.0, 9.0]),
-        (2, 0, 4, [2.1, 0.2], [2 * np.pi + 1.9, -15.0]),  # at most once around the triangle
+        (
+            2,
+            0,
+            4,
+            [2.1, 0.2],
+            [2 * np.pi + 1.9, -15.0],
+        ),  # at most once around the triangle
         (0, 2, 4, [2.1 - np.pi, 0.2], [np.pi + 1.9, -14.0]),
     ):
-        q, count = corner_on_side(shapes, below, above, begin + s * (np.array(end) - begin))
+        q, count = corner_on_side(
+            shapes, below, above, begin + s * (np.array(end) - begin)
+        )
         gaps, margin = (np.asarray(x) for x in seen(jnp.asarray(q)))
         pair = np.abs(gaps[:, column : column + 2])
         np.testing.assert_allclose(pair.min(axis=1), 0.0, atol=1e-14)
@@ -325,9 +377,16 @@ def test_a_contact_keeps_its_place_where_sides_change():
     for first in ((0, 1), (1, 0)):
         pair = ji.Bodies([shapes[i] for i in first], planes=())
         places = []
-        for turn in (-0.1, -0.7, -0.9, -1.5):  # its base, 0.05 m left of the middle, is at the edge
+        for turn in (
+            -0.1,
+            -0.7,
+            -0.9,
+            -1.5,
+        ):  # its base, 0.05 m left of the middle, is at the edge
             c, s = np.cos(turn), np.sin(turn)
-            middle = np.array([1.0, 0.5]) - np.array([c * -0.05 - s * -0.1, s * -0.05 + c * -0.1])
+            middle = np.array([1.0, 0.5]) - np.array(
+                [c * -0.05 - s * -0.1, s * -0.05 + c * -0.1]
+            )
             q = np.stack([[*middle, turn], np.zeros(3)])[list(first)].ravel()
             gaps = np.asarray(pair.gap_function(jnp.asarray(q)))
             places.append(int(np.argmin(np.abs(gaps))))
@@ -379,11 +438,15 @@ def test_contacts_of_a_box(brick):
     signs = np.array([*itertools.product((-1, 1), repeat=3)])
     own = signs * (np.array([0.3, 0.2, 0.1]) / 2 - 0.02) - off
     np.testing.assert_allclose(q[:3], [0.1, 0.2, 0.9] + r @ off, atol=1e-15)
-    np.testing.assert_allclose(gaps, (np.asarray(q[:3]) + own @ r.T) @ n - 0.02, atol=1e-15)
+    np.testing.assert_allclose(
+        gaps, (np.asarray(q[:3]) + own @ r.T) @ n - 0.02, atol=1e-15
+    )
     first = np.array([n[2], 0, -n[0]]) / np.hypot(n[0], n[2])
     axes = {0: first, 1: np.cross(n, first)}
     for i, c in enumerate(own @ r.T):
-        np.testing.assert_allclose(normals[:, i], [*n, *(r.T @ np.cross(c, n))], atol=1e-15)
+        np.testing.assert_allclose(
+            normals[:, i], [*n, *(r.T @ np.cross(c, n))], atol=1e-15
+        )
         for k, t in axes.items():
             arm = r.T @ np.cross(c - 0.02 * n, t)
             np.testing.assert_allclose(tangents[:, 2 * i + k], [*t, *arm], atol=1e-15)
@@ -403,13 +466,21 @@ def test_turning_is_exact(brick):
     """`moved` is a rotation about the body's axes, `rates` its derivative, spin does no work."""
     box, turn, _, q, v, (parts, (after, rates, spin), slopes) = brick
     e = np.roll((turn * Rotation.from_rotvec(v[3:])).as_quat(), 1)
-    np.testing.assert_allclose(after, [*(q[:3] + v[:3]), *(e * np.sign(e @ after[3:]))], atol=1e-14)
-    step = (np.asarray(box.moved(q, 1e-6 * v)) - np.asarray(box.moved(q, -1e-6 * v))) / 2e-6
+    np.testing.assert_allclose(
+        after, [*(q[:3] + v[:3]), *(e * np.sign(e @ after[3:]))], atol=1e-14
+    )
+    step = (
+        np.asarray(box.moved(q, 1e-6 * v)) - np.asarray(box.moved(q, -1e-6 * v))
+    ) / 2e-6
     np.testing.assert_allclose(rates, step, atol=1e-9)
     np.testing.assert_allclose(parts[1].T @ v, slopes, atol=1e-9)
-    np.testing.assert_allclose(spin[3:], -np.cross(v[3:], np.asarray(box.inertia) @ v[3:]))
+    np.testing.assert_allclose(
+        spin[3:], -np.cross(v[3:], np.asarray(box.inertia) @ v[3:])
+    )
     assert abs(float(spin @ v)) < 1e-15
-    small = [np.asarray(box.moved(q, s * v)) for s in (0.0267, 0.0268)]  # the series ends between
+    small = [
+        np.asarray(box.moved(q, s * v)) for s in (0.0267, 0.0268)
+    ]  # the series ends between
     assert np.abs(small[1] - small[0] - 1e-4 * rates).max() < 2e-5
     weight = box.pulled(q, jax.grad(box.gravity(10.0))(q))
     np.testing.assert_allclose(weight, [0, 0, 20, 0, 0, 0], atol=1e-15)
@@ -418,10 +489,14 @@ def test_turning_is_exact(brick):
 @pytest.mark.slow
 def test_a_quaternion_must_have_length_one():
     ball = ji.Sphere(0.1)
-    with pytest.raises(ValueError, match=r"`quaternion` must have length 1, but has length 2"):
+    with pytest.raises(
+        ValueError, match=r"`quaternion` must have length 1, but has length 2"
+    ):
         ball.touching([2.0, 0, 0, 0])
     q = ball.touching()
-    with pytest.raises(ValueError, match=r"`q` must be in the range .*a quaternion of length 1"):
+    with pytest.raises(
+        ValueError, match=r"`q` must be in the range .*a quaternion of length 1"
+    ):
         ball.scene(q.at[3].set(1.01))
 
     @jax.jit
@@ -471,9 +546,13 @@ def test_every_body_can_be_drawn():
 
 
 def test_bodies_without_contacts_and_gaps_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"m >= 1 contacts of Bodies, but it returns \(0,\)"):
+    with pytest.raises(
+        ValueError, match=r"m >= 1 contacts of Bodies, but it returns \(0,\)"
+    ):
         piles.discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"):
+    with pytest.raises(
+        ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"
+    ):
         ji.scene_from_gaps(lambda q: q[None], [1.0], [0.5])
 
 

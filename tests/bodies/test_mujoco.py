@@ -33,14 +33,24 @@ BOX = 'name="box" type="box" size=".1 .15 .2" mass="1.5" friction=".3"'
 PILE = (
     body("0 0 .1999", BOX, euler="0 0 30", name="box")
     + body("0 0 .4995", 'name="ball" type="sphere" size=".1" mass=".7"')
-    + body(".145 .05 .3", 'name="rod" type="capsule" size=".05 .2" mass="2"', euler="5 0 30")
+    + body(
+        ".145 .05 .3",
+        'name="rod" type="capsule" size=".05 .2" mass="2"',
+        euler="5 0 30",
+    )
     + body(
         "-.7 0 .15",
         'name="arm" type="box" size=".1 .1 .1" mass="1"',
         joints='<joint type="hinge" axis="0 1 0" pos="-.3 0 0"/>',
     )
-    + body("-.7 0 .449", 'name="wheel" type="cylinder" size=".2 .05" mass="1"', euler="90 0 0")
-    + body(".8 0 .1495", 'name="tip" type="mesh" mesh="wedge" mass="1"', euler="10 20 0")
+    + body(
+        "-.7 0 .449",
+        'name="wheel" type="cylinder" size=".2 .05" mass="1"',
+        euler="90 0 0",
+    )
+    + body(
+        ".8 0 .1495", 'name="tip" type="mesh" mesh="wedge" mass="1"', euler="10 20 0"
+    )
 )
 
 
@@ -57,7 +67,9 @@ def pile():
 
 def mujoco_distance(model, data, first, second):
     mujoco.mj_forward(model, data)
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, n) for n in (first, second)]
+    ids = [
+        mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, n) for n in (first, second)
+    ]
     return mujoco.mj_geomDistance(model, data, *ids, 1.0, None)
 
 
@@ -72,7 +84,9 @@ def test_rows_are_those_of_mujoco(pile):
     np.testing.assert_allclose(ours, rows[starts], atol=1e-9)
     tangents = np.asarray(world.scene.tangents).T.reshape(len(starts), 2, -1)
     for k in (0, 1):
-        np.testing.assert_allclose(tangents[:, k], rows[np.add(starts, 1 + k)], atol=1e-9)
+        np.testing.assert_allclose(
+            tangents[:, k], rows[np.add(starts, 1 + k)], atol=1e-9
+        )
     np.testing.assert_array_equal(world.friction, [c.friction[0] for c in data.contact])
     inverse = np.linalg.inv(np.asarray(world.scene.mass))  # the diagonal of N^T M^-1 N
     w = np.einsum("ij,jk,ik->i", ours, inverse, ours)
@@ -101,7 +115,9 @@ def test_gap_velocities_are_rates_of_distances(pile):
             mujoco.mj_integratePos(model, data.qpos, data.qvel, sign * step)
             ends.append(mujoco_distance(model, data, *pair))
         data.qpos[:] = start
-        where = [name in (", ".join(pair), ", ".join(pair[::-1])) for name in world.names]
+        where = [
+            name in (", ".join(pair), ", ".join(pair[::-1])) for name in world.names
+        ]
         assert sum(where) == 1
         assert gamma[where] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-6)
 
@@ -109,7 +125,9 @@ def test_gap_velocities_are_rates_of_distances(pile):
 def test_energy_is_that_of_mujoco(pile):
     model, data, world = pile
     mujoco.mj_energyVel(model, data)
-    assert float(ji.kinetic_energy(world.scene, world.velocity)) == pytest.approx(data.energy[1])
+    assert float(ji.kinetic_energy(world.scene, world.velocity)) == pytest.approx(
+        data.energy[1]
+    )
 
 
 def test_a_box_is_our_box():
@@ -123,7 +141,9 @@ def test_a_box_is_our_box():
     scene = ours.scene(ours.at(data.qpos[:3], turned), closed_below=1e-9)
     touching = int(np.argmin(np.asarray(scene.gaps)))
     np.testing.assert_allclose(world.scene.mass, scene.mass, rtol=1e-12)
-    np.testing.assert_allclose(world.scene.normals[:, 0], scene.normals[:, touching], atol=1e-9)
+    np.testing.assert_allclose(
+        world.scene.normals[:, 0], scene.normals[:, touching], atol=1e-9
+    )
 
 
 def slider(number, x):
@@ -158,7 +178,9 @@ def test_a_planar_model_has_planar_tangents():
         f'<joint type="{kind}" axis="{axis}"/>'
         for kind, axis in (("slide", "1 0 0"), ("slide", "0 0 1"), ("hinge", "0 1 0"))
     )
-    model, data = load(body("0 0 .2", 'name="disc" type="sphere" size=".2" mass="1"', planar))
+    model, data = load(
+        body("0 0 .2", 'name="disc" type="sphere" size=".2" mass="1"', planar)
+    )
     world = ji.from_mujoco(model, data)
     assert world.scene.tangents.shape == (3, 1)
     # the lowest point slides at x' - r theta', whichever way the tangent points
@@ -167,14 +189,12 @@ def test_a_planar_model_has_planar_tangents():
     assert abs(tangent[0]) == pytest.approx(1.0)
 
 
-LINKED = body("0 0 .1", 'name="left" type="sphere" size=".1" mass="1"', name="a") + body(
-    ".5 0 .1", 'name="right" type="sphere" size=".1" mass="3"', name="b"
-)
+LINKED = body(
+    "0 0 .1", 'name="left" type="sphere" size=".1" mass="1"', name="a"
+) + body(".5 0 .1", 'name="right" type="sphere" size=".1" mass="3"', name="b")
 
 
-JOINED = (
-    '<equality><weld body1="a" body2="b"/><connect body1="a" body2="b" anchor="0 0 0"/></equality>'
-)
+JOINED = '<equality><weld body1="a" body2="b"/><connect body1="a" body2="b" anchor="0 0 0"/></equality>'
 
 
 @pytest.mark.parametrize("storage", ["sparse", "dense"])
@@ -187,7 +207,9 @@ def test_equality_constraints_are_bilateral_constraints(storage):
     np.testing.assert_allclose(h.T @ v, 0, atol=1e-12)
     # momentum about every axis of the welded pair is kept: M (v - qvel) is a reaction, in span(h)
     change = np.diag(np.asarray(world.scene.mass)) @ (v - data.qvel)
-    np.testing.assert_allclose(change - h @ np.linalg.lstsq(h, change)[0], 0, atol=1e-12)
+    np.testing.assert_allclose(
+        change - h @ np.linalg.lstsq(h, change)[0], 0, atol=1e-12
+    )
     # one rigid body: both ends at -1, so the weld moves straight down
     assert v[2] == pytest.approx(-1.0, abs=2e-3)
 
@@ -195,7 +217,9 @@ def test_equality_constraints_are_bilateral_constraints(storage):
 @pytest.mark.slow
 def test_a_welded_foot_and_a_locked_joint_at_its_stop_take_no_part():
     hinge = '<joint name="hinge" axis="0 1 0" range="-40 0" limited="true"/>'
-    arm = body("0 2 .5", 'type="sphere" size=".05" pos=".3 0 0" mass="2"', hinge, name="arm")
+    arm = body(
+        "0 2 .5", 'type="sphere" size=".05" pos=".3 0 0" mass="2"', hinge, name="arm"
+    )
     held = '<equality><joint joint1="hinge"/><weld body1="a"/></equality>'
     model, data = load(LINKED + arm, rest=held)
     data.qvel[8] = -1.4
@@ -203,7 +227,9 @@ def test_a_welded_foot_and_a_locked_joint_at_its_stop_take_no_part():
     assert world.scene.contacts == 3
     out = ji.impact(ji.Newton(0.3), world.scene, world.velocity)
     assert ji.STATUS[int(out.status)].name == "ok"
-    np.testing.assert_allclose(sorted(out.impulse), [0.0, 0.0, 3.0 * 1.3 * 1.4], atol=1e-9)
+    np.testing.assert_allclose(
+        sorted(out.impulse), [0.0, 0.0, 3.0 * 1.3 * 1.4], atol=1e-9
+    )
 
 
 def test_velocities_against_constraints_are_named():
@@ -214,9 +240,15 @@ def test_velocities_against_constraints_are_named():
 
 
 def test_what_is_left_out_is_named():
-    limited = '<joint name="knee" type="hinge" axis="0 1 0" limited="true" range="10 90"/>'
-    rolling = 'name="{}" type="sphere" size=".1" mass="1" condim="6" friction=".3 .1 .2"'
-    bodies = body("0 0 .04", rolling.format("sunk")) + body("1 0 1", 'size=".1"', limited)
+    limited = (
+        '<joint name="knee" type="hinge" axis="0 1 0" limited="true" range="10 90"/>'
+    )
+    rolling = (
+        'name="{}" type="sphere" size=".1" mass="1" condim="6" friction=".3 .1 .2"'
+    )
+    bodies = body("0 0 .04", rolling.format("sunk")) + body(
+        "1 0 1", 'size=".1"', limited
+    )
     model, data = load(
         bodies,
         rest='<contact><pair geom1="floor" geom2="sunk" condim="4" friction=".3 .6 .1 0 0"/></contact>',
@@ -237,7 +269,9 @@ def test_limits_of_joints_are_contacts():
     """A pendulum of length .5 m that swings into its limit with e = .5, and one near its limit."""
     hinge = '<joint name="{}" type="hinge" axis="0 1 0" pos="0 0 .5" limited="true" range="0 90"/>'
     ball = 'type="sphere" size=".1" mass="2"'
-    bodies = body("0 0 2", ball, hinge.format("knee")) + body("3 0 2", ball, hinge.format("hip"))
+    bodies = body("0 0 2", ball, hinge.format("knee")) + body(
+        "3 0 2", ball, hinge.format("hip")
+    )
     model, data = load(bodies)
     data.qpos[1] = 0.01
     data.qvel[:] = -2.0, -1.0
@@ -261,9 +295,13 @@ def test_contacts_without_friction_have_none():
 def test_errors_name_the_argument(monkeypatch):
     model, data = load(body("0 0 .2", BOX))
     other = mujoco.MjData(load(LINKED)[0])
-    with pytest.raises(ValueError, match="`data` must be of this model, with 7 positions"):
+    with pytest.raises(
+        ValueError, match="`data` must be of this model, with 7 positions"
+    ):
         ji.from_mujoco(model, other)
-    with pytest.raises(TypeError, match=r"`model` and `data` must be a mujoco\.MjModel"):
+    with pytest.raises(
+        TypeError, match=r"`model` and `data` must be a mujoco\.MjModel"
+    ):
         ji.from_mujoco("robot.xml", data)
     with pytest.raises(ValueError, match="margin"):
         ji.from_mujoco(model, data, margin=-1.0)
@@ -300,7 +338,9 @@ def bounce(solref, step, solimp, speed, phase):
     return data.qvel[2] / speed
 
 
-@pytest.mark.parametrize("solref", [(0.02, 0.554), (0.02, 0.1), (0.002, 1.0), (-1e5, -30.0)])
+@pytest.mark.parametrize(
+    "solref", [(0.02, 0.554), (0.02, 0.1), (0.002, 1.0), (-1e5, -30.0)]
+)
 @pytest.mark.parametrize("solimp", [FLAT, RISING])
 def test_restitution_is_that_of_mujoco(solref, solimp):
     step, speed = 0.004, 0.7
@@ -314,14 +354,17 @@ def test_small_steps_give_the_linear_oscillator():
     for zeta in (0.1, 0.554, 0.9):
         root = np.sqrt(1 - zeta**2)
         e = np.exp(-2 * zeta / root * np.arctan(root / zeta))
-        assert ji.mujoco_restitution((0.02, zeta), 1e-5, FLAT).mean == pytest.approx(e, abs=1e-3)
+        assert ji.mujoco_restitution((0.02, zeta), 1e-5, FLAT).mean == pytest.approx(
+            e, abs=1e-3
+        )
 
 
 @pytest.mark.parametrize("e", [0.02, 0.27, 0.9, 1.0])
 def test_a_solref_gives_its_restitution(e):
     solref = ji.mujoco_solref(e, 0.002)
     measured = [
-        bounce(solref, 0.002, (0.9, 0.95, 0.001, 0.5, 2.0), 1.0, x / 16) for x in range(1, 17)
+        bounce(solref, 0.002, (0.9, 0.95, 0.001, 0.5, 2.0), 1.0, x / 16)
+        for x in range(1, 17)
     ]
     assert np.mean(measured) == pytest.approx(e, abs=3e-3)
     assert ji.mujoco_restitution(solref, 0.002).mean == pytest.approx(e, abs=1e-6)

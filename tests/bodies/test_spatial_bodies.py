@@ -37,10 +37,16 @@ def places():
         pairs=[(0, 1), (2, 0), (2, 1), (0, 3)], fixed=[wall], places=[wall.at([-2.0, 0.0, 1.0])],
     )  # fmt: skip
     rows = list(NEAREST.values())
-    rows.append(([0.0, 0.0, CORE[2] - 0.15], [0.0, 0.0, 1.0]))  # the middle inside, .03 m deep
+    rows.append(
+        ([0.0, 0.0, CORE[2] - 0.15], [0.0, 0.0, 1.0])
+    )  # the middle inside, .03 m deep
     q = [
         bodies.at(
-            [MIDDLE + TURN.apply(np.asarray(p) + 0.12 * np.asarray(n)), [-1.75, 2.3, 1.4], MIDDLE],
+            [
+                MIDDLE + TURN.apply(np.asarray(p) + 0.12 * np.asarray(n)),
+                [-1.75, 2.3, 1.4],
+                MIDDLE,
+            ],
             [quaternion(TURN.inv()), [1, 0, 0, 0], quaternion(TURN)],
         )
         for p, n in rows
@@ -71,7 +77,9 @@ def test_gaps_of_spheres_boxes_planes_and_walls(places):
     np.testing.assert_allclose(gap[0, [0, 1]], [ball[2] + 0.9, 2.2], atol=1e-14)
     sloping = [0.6 * ball[0] + 0.8 * ball[2] + 8.9, 0.8 * 1.4 - 0.6 * 1.75 + 8.8]
     np.testing.assert_allclose(gap[0, [10, 11]], sloping, atol=1e-14)
-    np.testing.assert_allclose(gap[0, 20], np.linalg.norm(ball - [-1.75, 2.3, 1.4]) - 0.3)
+    np.testing.assert_allclose(
+        gap[0, 20], np.linalg.norm(ball - [-1.75, 2.3, 1.4]) - 0.3
+    )
     np.testing.assert_allclose(gap[0, 23], ball[0] + 2.0 - 0.05 - 0.1, atol=1e-14)
     np.testing.assert_allclose(normals, slope, atol=1e-13)
     assert np.abs(normals).max() > 0.99
@@ -100,24 +108,42 @@ def test_slip_is_that_of_the_points_in_contact(places):
                     arm = point - middle[body] - centre[body]
                     moves += sign * (v[6 * body : 6 * body + 3] + np.cross(spin, arm))
             across = moves - (moves @ normal) * normal
-            assert np.linalg.norm(slip[lane, c]) == pytest.approx(np.linalg.norm(across), abs=1e-12)
+            assert np.linalg.norm(slip[lane, c]) == pytest.approx(
+                np.linalg.norm(across), abs=1e-12
+            )
 
 
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda: ji.Bodies([ji.Sphere(1.0), ji.Disc(1.0)]), TypeError, r"holds a Disc\.$"),
-        (lambda: ji.Bodies([ji.Disc(1.0), ji.Sphere(1.0)]), TypeError, r"holds a Sphere\.$"),
+        (
+            lambda: ji.Bodies([ji.Sphere(1.0), ji.Disc(1.0)]),
+            TypeError,
+            r"holds a Disc\.$",
+        ),
+        (
+            lambda: ji.Bodies([ji.Disc(1.0), ji.Sphere(1.0)]),
+            TypeError,
+            r"holds a Sphere\.$",
+        ),
         (lambda: ji.Bodies([ji.Disc(1.0)], pairs=[], room=9), ValueError, "`room`"),
         (lambda: ji.Bodies([ji.Dimer(0.1, 1.0)], room=9), TypeError, "not Dimer"),
-        (lambda: ji.Bodies([ji.Disc(1.0)], fixed=[ji.Disc(1.0)]), ValueError, "`fixed`"),
+        (
+            lambda: ji.Bodies([ji.Disc(1.0)], fixed=[ji.Disc(1.0)]),
+            ValueError,
+            "`fixed`",
+        ),
         (
             lambda: ji.Bodies([ji.Box([1, 1, 1])] * 2),
             ValueError,
             r"the pair \(0, 1\): two boxes have no gap function\. .* `jimpact\.from_mujoco`",
         ),
         (lambda: ji.Bodies([ji.Sphere(1.0)], pairs=[(0, 1)]), ValueError, r"`pairs`"),
-        (lambda: ji.Bodies([ji.Sphere(1.0)], planes=()), ValueError, r"must give a contact"),
+        (
+            lambda: ji.Bodies([ji.Sphere(1.0)], planes=()),
+            ValueError,
+            r"must give a contact",
+        ),
         (
             lambda: ji.Bodies([ji.Sphere(1.0)], planes=[[0, 0, 0, 1]]),
             ValueError,

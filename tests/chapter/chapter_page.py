@@ -41,7 +41,14 @@ def line(cells):
 
 def cells(row, value):
     """The columns of a row."""
-    return [row.where, row.what, f"`{row.call}`", row.printed, shown(value), row.erratum]
+    return [
+        row.where,
+        row.what,
+        f"`{row.call}`",
+        row.printed,
+        shown(value),
+        row.erratum,
+    ]
 
 
 def page(sections, before):
@@ -49,7 +56,14 @@ def page(sections, before):
     heads = ["chapter", "what", "call", "printed", "ours", "erratum"]
     text = [HEAD.format(before=before)]
     for title, rows in sections.items():
-        text += [f"## {title}", "", line(heads), line(["---"] * len(heads)), *map(line, rows), ""]
+        text += [
+            f"## {title}",
+            "",
+            line(heads),
+            line(["---"] * len(heads)),
+            *map(line, rows),
+            "",
+        ]
     return "\n".join(text).rstrip() + "\n"
 
 
@@ -60,7 +74,9 @@ if __name__ == "__main__":
 
     made = {
         title: [
-            row.cells if isinstance(row, rows.Figure) else cells(row, rows.run(row.call))
+            row.cells
+            if isinstance(row, rows.Figure)
+            else cells(row, rows.run(row.call))
             for row in group
         ]
         for title, group in rows.SECTIONS.items()

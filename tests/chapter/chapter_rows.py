@@ -58,7 +58,14 @@ class Figure:
     @property
     def cells(self):
         command = f'`chapter_figures.draw("{self.number}")`'
-        return [f"Fig. {self.number}", FIGURES[self.number][0], command, "", "drawn", ""]
+        return [
+            f"Fig. {self.number}",
+            FIGURES[self.number][0],
+            command,
+            "",
+            "drawn",
+            "",
+        ]
 
 
 @cache

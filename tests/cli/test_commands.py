@@ -49,17 +49,26 @@ def test_a_study_knows_priors_and_names_of_entries(tmp_path):
         '\n[law.priors]\n"restitution[2]" = [0.85, 0.01]\n[law.bounds]\n"restitution[1]" = [0.5, 1]\n'
     )
     shots = SHOTS.replace(
-        "post_2[m/s]", "post_2[m/s],pre_3[m/s],post_3[m/s],sigma_1[m/s],sigma_2[m/s],sigma_3[m/s]"
+        "post_2[m/s]",
+        "post_2[m/s],pre_3[m/s],post_3[m/s],sigma_1[m/s],sigma_2[m/s],sigma_3[m/s]",
     )
-    shots = shots.replace("0.83", "0.83,0,0.1,1,1,1").replace("1.62", "1.62,0,0.2,1,1,1")
+    shots = shots.replace("0.83", "0.83,0,0.1,1,1,1").replace(
+        "1.62", "1.62,0,0.2,1,1,1"
+    )
     problem = ji.read_study(written(tmp_path, text, shots)).problem
     assert problem.priors == ((1, 0.85, 0.01),)
     np.testing.assert_array_equal(problem.domains, [[0.5, 1.0], [0.0, 1.0]])
-    of_scene = text.replace('"restitution[2]" =', '"mass[2]" = [1.0, 0.1]\n"restitution[2]" =')
-    of_scene = of_scene.replace('free = ["restitution"]', 'free = ["restitution", "mass[2]"]')
+    of_scene = text.replace(
+        '"restitution[2]" =', '"mass[2]" = [1.0, 0.1]\n"restitution[2]" ='
+    )
+    of_scene = of_scene.replace(
+        'free = ["restitution"]', 'free = ["restitution", "mass[2]"]'
+    )
     assert "mass[2]" in ji.read_study(written(tmp_path, of_scene, shots)).problem.names
     with pytest.raises(ValueError, match=r"\[law.priors\].*frictoin"):
-        ji.read_study(written(tmp_path, text.replace('"restitution[2]"', '"frictoin[2]"'), shots))
+        ji.read_study(
+            written(tmp_path, text.replace('"restitution[2]"', '"frictoin[2]"'), shots)
+        )
 
 
 def test_a_study_of_a_motion_may_fit_its_start(tmp_path):
@@ -73,7 +82,14 @@ def test_fit_of_a_study(tmp_path, capsys):
     options = ["--out", picture, "--seed", "1"]
     code, said = call(capsys, "fit", written(tmp_path), *options)
     assert code == 0
-    for words in ("study", "as measured", "corrected ", "Rank: ", "Warnings", "Picture: "):
+    for words in (
+        "study",
+        "as measured",
+        "corrected ",
+        "Rank: ",
+        "Warnings",
+        "Picture: ",
+    ):
         assert words in said.out
     assert picture.read_text().startswith("<?xml")
     assert f"folder {picture.parent} was made." in said.err
@@ -87,12 +103,29 @@ def test_fit_of_a_study(tmp_path, capsys):
 @pytest.mark.release
 def test_every_law_is_fitted(tmp_path, capsys):
     study = written(tmp_path)
-    code, said = call(capsys, "fit", study, "--law", "all", "--starts", "1", "--out", tmp_path)
+    code, said = call(
+        capsys, "fit", study, "--law", "all", "--starts", "1", "--out", tmp_path
+    )
     assert code == 0
-    for words in ("newton", "lzb", "left out", "verdict", "The simplest law that fits is newton"):
+    for words in (
+        "newton",
+        "lzb",
+        "left out",
+        "verdict",
+        "The simplest law that fits is newton",
+    ):
         assert words in said.out
     code, said = call(
-        capsys, "fit", study, "--law", "all", "--starts", "1", "--csv", "--out", tmp_path
+        capsys,
+        "fit",
+        study,
+        "--law",
+        "all",
+        "--starts",
+        "1",
+        "--csv",
+        "--out",
+        tmp_path,
     )
     lines = said.out.splitlines()
     assert lines[0] == "law,parameters,rms_m_per_s,left_out_m_per_s,aicc,verdict"
@@ -142,7 +175,10 @@ def test_fit_refuses_data(tmp_path, capsys):
     path = written(tmp_path, STUDY, SHOTS.replace("0.21,", "fast,"))
     code, said = call(capsys, "fit", path)
     assert code == 2
-    assert "shots.csv, line 2, column `post_1[m/s]`: the value must be a number" in said.err
+    assert (
+        "shots.csv, line 2, column `post_1[m/s]`: the value must be a number"
+        in said.err
+    )
 
 
 @pytest.mark.release
@@ -150,13 +186,17 @@ def test_compare(tmp_path, capsys):
     code, said = call(capsys, "compare", "--out", tmp_path, "--json")
     result = json.loads(said.out)
     assert code == 0
-    np.testing.assert_allclose(result["laws"]["moreau"]["velocity"], [-0.3, 0.65, 0.65], atol=1e-12)
+    np.testing.assert_allclose(
+        result["laws"]["moreau"]["velocity"], [-0.3, 0.65, 0.65], atol=1e-12
+    )
     assert set(result["laws"]) >= {"lzb", "newton", "moreau", "poisson", "binary"}
     assert (tmp_path / "jimpact-compare.png").stat().st_size > 10_000
     code, said = call(capsys, "compare", "--csv", "--out", tmp_path / "b.png")
     (row,) = [x for x in csv.DictReader(said.out.splitlines()) if x["law"] == "moreau"]
     np.testing.assert_allclose(float(row["v_3_plus"]), 0.65, atol=1e-12)
-    code, said = call(capsys, "compare", "--velocity", "2", "0", "0", "--out", tmp_path / "a.svg")
+    code, said = call(
+        capsys, "compare", "--velocity", "2", "0", "0", "--out", tmp_path / "a.svg"
+    )
     assert code == 0
     assert "measured" not in said.out
     assert "-0.6000" in said.out
@@ -174,7 +214,9 @@ def test_montecarlo(tmp_path, capsys):
     assert (tmp_path / "new" / "jimpact-montecarlo-study.png").stat().st_size > 10_000
     options = ["--json", "--out", "a.svg", "--folder", "run", "--keep-samples"]
     first = json.loads(call(capsys, "montecarlo", path, *options)[1].out)
-    more = json.loads(call(capsys, "montecarlo", path, *options, "--samples", "700")[1].out)
+    more = json.loads(
+        call(capsys, "montecarlo", path, *options, "--samples", "700")[1].out
+    )
     assert (first["samples"], more["samples"], more["resumed"]) == (600, 700, 512)
     code, said = call(capsys, "montecarlo", path, *options, "--seed", "6")
     assert code == 2
@@ -185,8 +227,16 @@ def test_montecarlo(tmp_path, capsys):
     ("old", "new", "message"),
     [
         ("seed = 5", "seeds = 5", "[monte_carlo] may have the keys velocity_m_per_s"),
-        ("velocity_m_per_s = [1.0, 0.0, -1.0]", "", "must have the key `velocity_m_per_s`"),
-        ("low = 0.0", "least = 0.0", "`gaps_m` in [monte_carlo] must have low and high, or mean"),
+        (
+            "velocity_m_per_s = [1.0, 0.0, -1.0]",
+            "",
+            "must have the key `velocity_m_per_s`",
+        ),
+        (
+            "low = 0.0",
+            "least = 0.0",
+            "`gaps_m` in [monte_carlo] must have low and high, or mean",
+        ),
         ("low = 0.0", "low = -1.0", "initial_energy"),
         ("samples = 600", "samples = 0", "`samples` must be an int >= 1"),
         ("samples = 600", "law = 3", "[monte_carlo.law] must be a table"),
@@ -196,7 +246,9 @@ def test_montecarlo(tmp_path, capsys):
 )
 def test_montecarlo_refuses(tmp_path, capsys, old, new, message):
     assert old in SAMPLED
-    code, said = call(capsys, "montecarlo", written(tmp_path, SAMPLED.replace(old, new)))
+    code, said = call(
+        capsys, "montecarlo", written(tmp_path, SAMPLED.replace(old, new))
+    )
     assert code == 2
     assert said.err.startswith("jimpact montecarlo: ")
     assert message in said.err
@@ -231,7 +283,9 @@ def test_simulate(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_study_of_the_documents(tmp_path):
-    text = (Path(__file__).parents[2] / "docs" / "motions.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "motions.md").read_text(
+        encoding="utf-8"
+    )
     (block,) = re.findall(r"```toml\n(.*?)```", text, re.S)
     study = ji.read_study(written(tmp_path, block))
     gaps = study.system.body.gap_function(np.array(study.arguments["q0"]))
@@ -248,7 +302,9 @@ def test_bundled_motions_begin_without_penetration(name):
 
 def test_motions_of_several_bodies_and_a_base_in_space(tmp_path):
     bodies = MOTION.replace("width_m = 0.2\nheight_m = 0.6\n", f"{BODIES['Bodies']}\n")
-    bodies = bodies.replace('kind = "block"', 'kind = "Bodies"').replace("horizontal", "vertical")
+    bodies = bodies.replace('kind = "block"', 'kind = "Bodies"').replace(
+        "horizontal", "vertical"
+    )
     system = ji.read_study(written(tmp_path, bodies)).system
     assert system.body.rims[0] == 0.1
     np.testing.assert_array_equal(system.base_directions, [[0.0], [1.0], [0.0]])
@@ -296,7 +352,9 @@ def test_fit_of_a_body(tmp_path, capsys):
         ("width_m = 0.2", "masses_kg = 1", "[scene] must have the key `width_m`"),
         ("0.3, 0.0]", "0.2, 0.0]", "must have no penetration"),
     ):
-        code, said = call(capsys, "fit", written(tmp_path, ON_GROUND.replace(old, new), TILTED))
+        code, said = call(
+            capsys, "fit", written(tmp_path, ON_GROUND.replace(old, new), TILTED)
+        )
         assert code == 2
         assert message in said.err
 
@@ -323,7 +381,10 @@ def test_simulate_in_space(tmp_path, capsys):
     assert (tmp_path / "m.gif").read_bytes().startswith(b"GIF89a")
     code, said = call(capsys, "simulate", path, "--samples", "3")
     assert code == 0
-    assert "jimpact simulate: jimpact-simulate-study.png existed and was replaced.\n" in said.err
+    assert (
+        "jimpact simulate: jimpact-simulate-study.png existed and was replaced.\n"
+        in said.err
+    )
 
 
 @pytest.mark.parametrize(
@@ -336,9 +397,21 @@ def test_simulate_in_space(tmp_path, capsys):
         ),
         ('kind = "block"', 'kind = "bodies"', "[system] must have the key `bodies`"),
         ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),
-        ("width_m", "width", "[system] must have the key `width_m`, but has kind, width"),
-        ("width_m", "depth_m = 1.0\nwidth_m", "may have the keys kind, width_m, height_m, mass_kg"),
-        ('"horizontal"', '"line"', "`direction` of a Block must be horizontal or vertical"),
+        (
+            "width_m",
+            "width",
+            "[system] must have the key `width_m`, but has kind, width",
+        ),
+        (
+            "width_m",
+            "depth_m = 1.0\nwidth_m",
+            "may have the keys kind, width_m, height_m, mass_kg",
+        ),
+        (
+            '"horizontal"',
+            '"line"',
+            "`direction` of a Block must be horizontal or vertical",
+        ),
         ("amplitude_m", "size_m", "[base] must have the key `amplitude_m`"),
         ("t_end_s", "t_end", "must have the key `t_end_s`"),
         ("[law]", "[laws]", "must have the key `law`"),
@@ -375,7 +448,9 @@ def test_chart(tmp_path, capsys):
 
 @pytest.mark.release
 def test_stability(tmp_path, capsys):
-    code, said = call(capsys, "stability", "--methods", "verlet", "--out", tmp_path, "--json")
+    code, said = call(
+        capsys, "stability", "--methods", "verlet", "--out", tmp_path, "--json"
+    )
     assert code == 0
     assert json.loads(said.out)["methods"]["verlet"]["counts"]["right"] > 3
 
@@ -409,7 +484,9 @@ def test_a_new_study(tmp_path, capsys, kind):
 
 
 def test_a_new_study_like_another(tmp_path, capsys):
-    assert call(capsys, "new", "simulate", "block", "--like", "rocking_block.toml")[0] == 0
+    assert (
+        call(capsys, "new", "simulate", "block", "--like", "rocking_block.toml")[0] == 0
+    )
     assert ji.read_study("block").system.body.names[2] == "angle [rad]"
     assert call(capsys, "new", "fit", "carts", "--like", "air_track.toml")[0] == 0
     assert len(ji.read_study("carts").experiments.shots) == 5
@@ -496,13 +573,27 @@ MISSPELLED = [
     (["fit", "--law", "Newtn"], "the law must be one of lzb", "Did you mean newton?"),
     (["fit", "--method", "adm"], "`method` must be one of", "Did you mean adam?"),
     (["fit", "three_bals.toml"], "does not exist", "Did you mean three_balls.toml?"),
-    (["chart", "--methods", "verlt"], "`methods` must be one of", "Did you mean verlet?"),
+    (
+        ["chart", "--methods", "verlt"],
+        "`methods` must be one of",
+        "Did you mean verlet?",
+    ),
 ]
 
 
 MISSPELLED_KEYS = [
-    ("restitution =", "restituton =", "[law] may have the keys", "Did you mean restitution?"),
-    ('free = ["restitution"]', "free = ['friktion']", "`free` must name", "Did you mean friction?"),
+    (
+        "restitution =",
+        "restituton =",
+        "[law] may have the keys",
+        "Did you mean restitution?",
+    ),
+    (
+        'free = ["restitution"]',
+        "free = ['friktion']",
+        "`free` must name",
+        "Did you mean friction?",
+    ),
     ("starts = 2", "losss = 'huber'", "[fit] may have the keys", "Did you mean loss?"),
     ("starts = 2", "loss = 'hubber'", "`loss` must be one of", "Did you mean huber?"),
     ('"Newton"', '"mureau"', "the law must be one of", "Did you mean moreau?"),
@@ -536,8 +627,12 @@ def test_a_folder_without_a_study(tmp_path, capsys):
 def test_nan_cells_are_reported_once(tmp_path, capsys):
     shots = SHOTS.replace("0.21,", "NaN,")
     path = written(tmp_path, STUDY, shots)
-    _, said = call(capsys, "compare", path, "--velocity", "0", "0")  # read twice, then refused
-    assert said.err.count("shots.csv, line 2, column `post_1[m/s]`: the cell is NaN") == 1
+    _, said = call(
+        capsys, "compare", path, "--velocity", "0", "0"
+    )  # read twice, then refused
+    assert (
+        said.err.count("shots.csv, line 2, column `post_1[m/s]`: the cell is NaN") == 1
+    )
 
 
 @pytest.mark.parametrize("velocity", [["0", "0", "0"], ["-1", "0", "1"]])
@@ -549,7 +644,13 @@ def test_velocities_without_an_impact_are_refused(capsys, velocity):
 
 def test_wrong_options_are_reported_before_jax_is_imported(tmp_path):
     """Version, help, and wrong options, one process for all."""
-    calls = [["--version"], ["--help"], ["fti"], ["fit", "--limit", "0"], ["fit", "--out", "a.txt"]]
+    calls = [
+        ["--version"],
+        ["--help"],
+        ["fti"],
+        ["fit", "--limit", "0"],
+        ["fit", "--out", "a.txt"],
+    ]
     calls += [["montecarlo", "--executor", "dusk"]]
     code = (
         "import sys\nfrom jimpact.cli.main import main\n"
@@ -559,7 +660,11 @@ def test_wrong_options_are_reported_before_jax_is_imported(tmp_path):
         "print([m for m in ('jax', 'matplotlib', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
     )
     assert f"jimpact {ji.__version__}\n" in done.stdout
     assert "montecarlo" in done.stdout
@@ -578,7 +683,9 @@ def interrupted(arguments, folder, moment):
     The exit code is None if the command ended before.
     """
     command = [sys.executable, "-m", "jimpact.cli", *arguments]
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # an ignored one would be inherited
     process = subprocess.Popen(
         command,
         stdout=subprocess.DEVNULL,
@@ -602,9 +709,14 @@ def test_ctrl_c_keeps_finished_chunks(tmp_path):
     path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
     run = tmp_path / "run"
     options = ["montecarlo", path, "--folder", "run"]
-    code, message = interrupted(options, tmp_path, lambda _: list(run.glob("chunk-*.npz")))
+    code, message = interrupted(
+        options, tmp_path, lambda _: list(run.glob("chunk-*.npz"))
+    )
     assert code == 130
-    assert "Finished chunks are in 'run': the same command continues from there." in message
+    assert (
+        "Finished chunks are in 'run': the same command continues from there."
+        in message
+    )
     assert "Traceback" not in message
 
 
@@ -624,13 +736,17 @@ def after_jax(seconds):
 @pytest.mark.parametrize(
     "verb",
     [
-        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        pytest.param(
+            x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release
+        )
         for x in VERBS
     ],
 )
 def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
     """One line and exit code 130, whatever the command is doing then."""
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
+    monkeypatch.delenv(
+        "JAX_COMPILATION_CACHE_DIR"
+    )  # so that there is something to compile
     monkeypatch.setenv("JIMPACT_CACHE", "")
     for seconds in (0.0, 1.0, 3.0):
         code, message = interrupted([verb], tmp_path, after_jax(seconds))
@@ -646,11 +762,15 @@ def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     """The bundled three balls: one e; corrected; all free, since asked for; a picture."""
     command = [sys.executable, "-m", "jimpact.cli", "fit", "--json", "--all-free"]
     monkeypatch.delenv("COLUMNS", raising=False)
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert all(len(line) <= 80 for line in done.stderr.splitlines())
     fits = json.loads(done.stdout)["fits"]
     for name, rms in (("as measured", 0.0166), ("momentum corrected", 0.0089)):
-        np.testing.assert_allclose(fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4)
+        np.testing.assert_allclose(
+            fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4
+        )
         np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
     assert fits["all free"]["rank"] == 2
     assert len(fits["all free"]["parameters"]) == 3

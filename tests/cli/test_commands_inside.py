@@ -25,7 +25,9 @@ def in_its_own_folder(tmp_path, monkeypatch):
 
 
 def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path):
-    text = STUDY.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]").replace('"Newton"', '"lzb"\nrtol = 1e-5')
+    text = STUDY.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]").replace(
+        '"Newton"', '"lzb"\nrtol = 1e-5'
+    )
     shots = SHOTS.replace("0.83", "0.83,0,0.1").replace("1.62", "1.62,0,0.2")
     shots = shots.replace("post_2[m/s]", "post_2[m/s],pre_3[m/s],post_3[m/s]")
     study, all_free = _per_contact(ji.read_study(written(tmp_path, text, shots)))
@@ -36,7 +38,12 @@ def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path)
 
 def test_where_programs_are_kept(tmp_path, monkeypatch):
     folder, enabled = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
-    for name in (folder, enabled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JIMPACT_CACHE"):
+    for name in (
+        folder,
+        enabled,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+        "JIMPACT_CACHE",
+    ):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -83,7 +90,9 @@ def test_unwritable_places_are_refused_before_anything_is_computed(
 ):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.html").mkdir()
-    monkeypatch.setattr("jimpact.cli.main.cache_folder", None)  # a command that runs would call it
+    monkeypatch.setattr(
+        "jimpact.cli.main.cache_folder", None
+    )  # a command that runs would call it
     code, said = call(capsys, *arguments)
     assert code == 2
     assert f"{arguments[1]} must be" in said.err

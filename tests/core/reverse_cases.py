@@ -15,7 +15,9 @@ def both_modes(law, scene, v, e, k, adjoint="jacobian"):
         return ji.impact(law(e, k, adjoint), scene, v).velocity @ weight
 
     def forward(e):
-        return jax.jvp(lambda e, k: after(e, k, "forward"), (e, k), (jnp.ones_like(e), way))[1]
+        return jax.jvp(
+            lambda e, k: after(e, k, "forward"), (e, k), (jnp.ones_like(e), way)
+        )[1]
 
     def reverse(e):
         de, dk = jax.grad(lambda e, k: after(e, k, adjoint), argnums=(0, 1))(e, k)

@@ -43,7 +43,9 @@ def test_the_package_asks_nothing_of_the_inside_of_jax():
             for name in names:
                 if path.name == "derive.py" and name in operations:
                     continue
-                assert not name.startswith(("jax._src", "jax.interpreters", "jax.extend")), path
+                assert not name.startswith(
+                    ("jax._src", "jax.interpreters", "jax.extend")
+                ), path
 
 
 def test_an_adjoint_that_does_not_exist():
@@ -55,7 +57,9 @@ def test_an_adjoint_that_does_not_exist():
 def test_adjoints_agree_where_they_have_a_mode():
     exact = jax.jit(jax.jacfwd(last_velocity("jacobian")))(AT)
     for mode, adjoint in ((jax.grad, "jacobian"), (jax.jacfwd, "forward")):
-        np.testing.assert_allclose(jax.jit(mode(last_velocity(adjoint)))(AT), exact, rtol=1e-8)
+        np.testing.assert_allclose(
+            jax.jit(mode(last_velocity(adjoint)))(AT), exact, rtol=1e-8
+        )
     twice = [jax.jit(f)(AT) for f in (
         jax.hessian(last_velocity("jacobian")),
         jax.jacfwd(jax.jacfwd(last_velocity("forward"))),

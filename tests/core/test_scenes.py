@@ -34,10 +34,14 @@ def test_chain_is_the_dense_scene(wall):
     np.testing.assert_allclose(dense(ji.delassus_matrix(chain)), w, atol=1e-14)
     np.testing.assert_allclose(ji.delassus_matrix(chain) @ p, w @ p, atol=1e-14)
     np.testing.assert_allclose(ji.gap_velocity(chain, v), normals.T @ v)
-    np.testing.assert_allclose(ji.velocity_change(chain, p), np.linalg.solve(mass, normals @ p))
+    np.testing.assert_allclose(
+        ji.velocity_change(chain, p), np.linalg.solve(mass, normals @ p)
+    )
     np.testing.assert_allclose(ji.kinetic_energy(chain, v), 0.5 * v @ mass @ v)
     np.testing.assert_allclose(ji.momentum(chain, v), mass @ v)
-    np.testing.assert_allclose(dense(ji.delassus_matrix(ji.Scene(mass, normals))), w, atol=1e-14)
+    np.testing.assert_allclose(
+        dense(ji.delassus_matrix(ji.Scene(mass, normals))), w, atol=1e-14
+    )
     if wall == "right":
         np.testing.assert_array_equal(ji.chain(masses, wall="right").normals, normals)
 
@@ -48,17 +52,23 @@ def test_an_indefinite_mass_has_no_outcome_inside_jit():
 
     @jax.jit
     def status(mass):
-        return ji.impact(ji.Newton(0.5), ji.Scene(mass, normals), [1.0, 0.0, 0.0]).status
+        return ji.impact(
+            ji.Newton(0.5), ji.Scene(mass, normals), [1.0, 0.0, 0.0]
+        ).status
 
     assert ji.STATUS[int(status(np.eye(3)))].name == "ok"
-    assert ji.STATUS[int(status(np.eye(3) - 1.5 * np.outer([0, 0, 1], [0, 0, 1])))].failure
+    assert ji.STATUS[
+        int(status(np.eye(3) - 1.5 * np.outer([0, 0, 1], [0, 0, 1])))
+    ].failure
 
 
 def test_kinetic_angles_of_tied_bodies():
     """Pairs 1-2 and 3-4, 2 tied to 3: cos = (1/2) / (1 + 1/2); by the masses alone (6.66) pi/2."""
     mass, pairs = [1.0] * 4, [[-1.0, 0], [1, 0], [0, -1], [0, 1]]
     tied = ji.Scene(mass, pairs, constraints=[[0.0], [1], [-1], [0]])
-    assert float(ji.theory.kinetic_angles(tied)[0, 1]) == pytest.approx(np.arccos(1 / 3), abs=1e-12)
+    assert float(ji.theory.kinetic_angles(tied)[0, 1]) == pytest.approx(
+        np.arccos(1 / 3), abs=1e-12
+    )
     free = ji.theory.kinetic_angles(ji.Scene(mass, pairs))
     assert float(free[0, 1]) == pytest.approx(np.pi / 2, abs=1e-12)
 
@@ -82,12 +92,18 @@ def test_welded_bodies_are_one(name):
     def out(v, e, k):
         law = make(e, k, jnp.full(2, 1.5), jnp.zeros(2))
         scene = ji.Scene(jnp.array([1.0, 2.0, 0.5, 0.7]), normals, constraints=welded)
-        return ji.impact(law, scene, v), ji.audit(ji.impact(law, scene, v), scene, v).momentum
+        return ji.impact(law, scene, v), ji.audit(
+            ji.impact(law, scene, v), scene, v
+        ).momentum
 
     e, k = np.array([0.9, 0.6]), np.array([1.0, 2.5])
     got, momentum = out(np.array([1.0, 0.1, 0.1, -0.4]), e, k)
-    same, _ = programs.values(name)([programs.chain([1, 2.5, 0.7], [1, 0.1, -0.4], e=e, k=k)])
-    np.testing.assert_allclose(np.asarray(got.velocity)[[0, 1, 3]], same.velocity[0, :3], atol=2e-8)
+    same, _ = programs.values(name)(
+        [programs.chain([1, 2.5, 0.7], [1, 0.1, -0.4], e=e, k=k)]
+    )
+    np.testing.assert_allclose(
+        np.asarray(got.velocity)[[0, 1, 3]], same.velocity[0, :3], atol=2e-8
+    )
     np.testing.assert_allclose(got.velocity[1], got.velocity[2], atol=1e-13)
     np.testing.assert_allclose(got.impulse, same.impulse[0, :2], atol=4e-8)
     assert bool(momentum)
@@ -116,7 +132,9 @@ def test_contacts_that_constraints_hold_take_no_part(name):
 
     @jax.jit
     @jax.vmap
-    def run(held, weights):  # coordinates: position and height of the ball, three of the foot
+    def run(
+        held, weights
+    ):  # coordinates: position and height of the ball, three of the foot
         constraints = jnp.concatenate([jnp.zeros((2, 2)), held])
         foot = jnp.concatenate([jnp.zeros(2), held @ weights])
         normals = jnp.stack([jnp.array([0.0, 1.0, 0.0, 0.0, 0.0]), foot], axis=1)
@@ -158,7 +176,10 @@ def test_scene_from_gaps_is_the_block():
     def gaps(q):  # q = (x, y, theta): corners of a block on the ground
         _, y, t = q
         return jnp.stack(
-            [y - height / 2 * jnp.cos(t) + s * width / 2 * jnp.sin(t) for s in (1.0, -1.0)]
+            [
+                y - height / 2 * jnp.cos(t) + s * width / 2 * jnp.sin(t)
+                for s in (1.0, -1.0)
+            ]
         )
 
     def mass(q):
@@ -166,7 +187,9 @@ def test_scene_from_gaps_is_the_block():
 
     scene = ji.scene_from_gaps(gaps, mass, [0.0, height / 2, 0.0])
     np.testing.assert_allclose(
-        scene.normals, ji.Block(width, height, corners="base").scene().normals, atol=1e-15
+        scene.normals,
+        ji.Block(width, height, corners="base").scene().normals,
+        atol=1e-15,
     )
     assert not np.asarray(scene.gaps).any()
     lifted = ji.scene_from_gaps(gaps, mass, [0.0, height / 2 + 1e-3, 0.0])
@@ -176,7 +199,9 @@ def test_scene_from_gaps_is_the_block():
     slope = jax.grad(
         lambda t: ji.scene_from_gaps(gaps, mass, jnp.stack([0.0, 1.2, t])).normals[2, 0]
     )(0.1)
-    assert float(slope) == pytest.approx(height / 2 * np.cos(0.1) - width / 2 * np.sin(0.1))
+    assert float(slope) == pytest.approx(
+        height / 2 * np.cos(0.1) - width / 2 * np.sin(0.1)
+    )
 
 
 # ---------------------------------------------------------------- gaps and tangents of bodies
@@ -188,8 +213,16 @@ def test_block_away_from_rest():
     scene = built(ji.Block, width, height, 2.0, corners="base", at=(angle,))
     s, c = np.sin(angle), np.cos(angle)
     np.testing.assert_allclose(scene.gaps, [width * s, 0.0], atol=1e-15)
-    normals = [[0, 0], [1, 1], [height / 2 * s + width / 2 * c, height / 2 * s - width / 2 * c]]
-    tangents = [[1, 1], [0, 0], [height / 2 * c - width / 2 * s, height / 2 * c + width / 2 * s]]
+    normals = [
+        [0, 0],
+        [1, 1],
+        [height / 2 * s + width / 2 * c, height / 2 * s - width / 2 * c],
+    ]
+    tangents = [
+        [1, 1],
+        [0, 0],
+        [height / 2 * c - width / 2 * s, height / 2 * c + width / 2 * s],
+    ]
     np.testing.assert_allclose(scene.normals, normals, atol=1e-15)
     np.testing.assert_allclose(scene.tangents, tangents, atol=1e-15)
     np.testing.assert_allclose(scene.mass, [2.0, 2.0, 2 * (4 + 2.25) / 12])
@@ -206,7 +239,9 @@ def test_dimer_tangents_are_the_slip_of_the_lowest_points():
         lever = np.array([side * np.cos(angle), side * np.sin(angle) - radius])
         slip = np.array([1.0, 0.0, -lever[1]])  # v + omega x lever, along x
         np.testing.assert_allclose(scene.tangents[:, contact], slip, atol=1e-14)
-        np.testing.assert_allclose(scene.normals[:, contact], [0, 1, lever[0]], atol=1e-14)
+        np.testing.assert_allclose(
+            scene.normals[:, contact], [0, 1, lever[0]], atol=1e-14
+        )
     inertia = 2 * 2.0 * (0.4 * radius**2 + arm**2) + 0.5 * length**2 / 12
     np.testing.assert_allclose(scene.mass, [4.5, 4.5, inertia])
 
@@ -214,15 +249,21 @@ def test_dimer_tangents_are_the_slip_of_the_lowest_points():
 def test_dimer_in_space():
     """M and H_t against rigid-body mechanics, angular velocity in the body's axes."""
     pitch, yaw, radius, length = 0.4, 1.1, 0.3, 1.1
-    axis = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
+    axis = np.array(
+        [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
+    )
     up, across = np.array([0.0, 0.0, 1.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    turning = np.stack([axis, across, np.cross(axis, across)], axis=1)  # the body's axes
+    turning = np.stack(
+        [axis, across, np.cross(axis, across)], axis=1
+    )  # the body's axes
     (a, b), (c, s) = np.cos([yaw / 2, pitch / 2]), np.sin([yaw / 2, pitch / 2])
     e = np.array([a * b, c * s, -a * s, c * b])  # yaw about z, then -pitch about y
     scene = built(ji.SpatialDimer, radius, length, 2.0, 0.5, at=(e,))
     arm, about = length / 2 + radius, 0.8 * 2.0 * radius**2
     planar = 2 * 2.0 * (0.4 * radius**2 + arm**2) + 0.5 * length**2 / 12
-    np.testing.assert_allclose(scene.mass, [*3 * [4.5], about, planar, planar], atol=1e-14)
+    np.testing.assert_allclose(
+        scene.mass, [*3 * [4.5], about, planar, planar], atol=1e-14
+    )
     for contact, side in enumerate((arm, -arm)):
         lever = side * axis - radius * up
         velocity = np.concatenate([np.eye(3), np.cross(turning.T, lever).T], axis=1)
@@ -281,8 +322,12 @@ def test_scenes_are_differentiable_in_their_arguments():
 
     x, step = jnp.array([1.0, 1.7, 0.2]), 1e-6 * jnp.eye(3)
     moved = jnp.concatenate([x[None] + step, x[None] - step])
-    slope, values = jax.jit(lambda x, y: (jax.grad(outcome)(x), jax.vmap(outcome)(y)))(x, moved)
-    np.testing.assert_allclose(slope, (values[:3] - values[3:]) / 2e-6, rtol=1e-7, atol=1e-8)
+    slope, values = jax.jit(lambda x, y: (jax.grad(outcome)(x), jax.vmap(outcome)(y)))(
+        x, moved
+    )
+    np.testing.assert_allclose(
+        slope, (values[:3] - values[3:]) / 2e-6, rtol=1e-7, atol=1e-8
+    )
 
 
 @pytest.mark.slow
@@ -294,7 +339,9 @@ def test_float32_is_kept(name):
     law = programs.LAWS[name].make(*(jnp.full(2, x, f) for x in (0.9, 1.0, 1.5, 0.0)))
     out = ji.impact(law, scene, jnp.array([1.0, 0.1, -0.4], f))
     assert {x.dtype for x in jax.tree.leaves(out)} == {np.dtype(f), np.dtype(np.int32)}
-    full, _ = programs.values(name)([programs.chain([1, 2, 0.7], [1, 0.1, -0.4], e=0.9)])
+    full, _ = programs.values(name)(
+        [programs.chain([1, 2, 0.7], [1, 0.1, -0.4], e=0.9)]
+    )
     np.testing.assert_allclose(out.velocity, full.velocity[0, :3], atol=1e-4)
     assert programs.names(out.status) == programs.names(full.status)
 
@@ -345,22 +392,66 @@ def test_statuses_go_from_mild_to_grave():
     assert set(wanted.split()) <= set(reported)
 
 
-FLAT = [[0.0, 0.0], [1.0, 1.0], [0.5, -0.5]]  # normals of a block of width 1, (x, y, angle)
+FLAT = [
+    [0.0, 0.0],
+    [1.0, 1.0],
+    [0.5, -0.5],
+]  # normals of a block of width 1, (x, y, angle)
 UPRIGHT = [[1.0, 1.0], [0.0, 0.0], [0.7, 0.7]]
 
 
 @pytest.mark.parametrize(
     ("mass", "normals", "tangents", "message"),
     [
-        ([2.0, 2.0, 0.4], FLAT, [[1, 1.0], [0, 0.2], [0.7, 0.7]], r"contact 2 are not at right"),
-        ([2.0, 2.0, 0.4], FLAT, [[1, 2.0], [0, 0.0], [0.7, 1.4]], r"contact 2 are not .*length"),
-        ([2.0, 2.0, 0.4], FLAT, np.array(FLAT)[:, [1, 1]], r"contact 2 depend on each other"),
-        ([2.0, 2.0, 0.4], FLAT, [[1, 0.0], [0, 0.0], [0.7, 0.0]], r"contact 2 depend on each"),
-        ([1.0] * 3, [[0.0], [0.0], [1.0]], [[1, 1.0], [0, 0], [0, 0]], r"contact 1 depend on each"),
-        ([1.0] * 3, [[0.0], [0.0], [1.0]], [[1, 0.6], [0, 0.8], [0, 0]], r"contact 1 are not at"),
-        (np.eye(3) + np.eye(3)[::-1] / 2, FLAT, [[1, 1], [0.2] * 2, [0.7] * 2], None),  # coupled
+        (
+            [2.0, 2.0, 0.4],
+            FLAT,
+            [[1, 1.0], [0, 0.2], [0.7, 0.7]],
+            r"contact 2 are not at right",
+        ),
+        (
+            [2.0, 2.0, 0.4],
+            FLAT,
+            [[1, 2.0], [0, 0.0], [0.7, 1.4]],
+            r"contact 2 are not .*length",
+        ),
+        (
+            [2.0, 2.0, 0.4],
+            FLAT,
+            np.array(FLAT)[:, [1, 1]],
+            r"contact 2 depend on each other",
+        ),
+        (
+            [2.0, 2.0, 0.4],
+            FLAT,
+            [[1, 0.0], [0, 0.0], [0.7, 0.0]],
+            r"contact 2 depend on each",
+        ),
+        (
+            [1.0] * 3,
+            [[0.0], [0.0], [1.0]],
+            [[1, 1.0], [0, 0], [0, 0]],
+            r"contact 1 depend on each",
+        ),
+        (
+            [1.0] * 3,
+            [[0.0], [0.0], [1.0]],
+            [[1, 0.6], [0, 0.8], [0, 0]],
+            r"contact 1 are not at",
+        ),
+        (
+            np.eye(3) + np.eye(3)[::-1] / 2,
+            FLAT,
+            [[1, 1], [0.2] * 2, [0.7] * 2],
+            None,
+        ),  # coupled
         ([2.0, 2.0, 0.4], FLAT, UPRIGHT, None),
-        ([2.0, 2.0, 2.0], FLAT, UPRIGHT, None),  # an inertia that happens to be the mass
+        (
+            [2.0, 2.0, 2.0],
+            FLAT,
+            UPRIGHT,
+            None,
+        ),  # an inertia that happens to be the mass
         ([2.0], [[1.0]], [[0.5]], None),  # one coordinate, a pendulum
     ],
 )

@@ -10,7 +10,10 @@ from jimpact import read_study
 @pytest.mark.slow
 def test_the_cube():
     data = ji.data.cube_impacts()
-    assert read_study("tossed_cube.toml").experiments.shots == data.only(data.contacts == 1).shots
+    assert (
+        read_study("tossed_cube.toml").experiments.shots
+        == data.only(data.contacts == 1).shots
+    )
     assert [int((data.contacts == m).sum()) for m in (1, 2, 4)] == [377, 21, 2]
     assert data.units == ("m/s",) * 3 + ("rad/s",) * 3
     assert 0 < np.median(data.energy_ratio()) < 1
@@ -49,7 +52,9 @@ def test_measured_drops():
     assert [int((square.contacts == m).sum()) for m in (1, 2)] == [250, 15]
     numbers, time, q = ji.data.square_drops()
     assert q.shape == (len(numbers), len(time), 3) == (100, 200, 3)
-    np.testing.assert_allclose(np.median(q[:, -1, 1]), 0.03, atol=2e-4)  # at rest, half of a side
+    np.testing.assert_allclose(
+        np.median(q[:, -1, 1]), 0.03, atol=2e-4
+    )  # at rest, half of a side
     fourth = q[list(numbers).index(6)]  # impact 6:12.6 lies between frames 12 and 13
     low = np.asarray(ji.Block(0.06, 0.06).gap_function(fourth[13])).min()
     assert "6:12.6" in square.shots

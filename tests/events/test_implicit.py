@@ -13,15 +13,36 @@ from spatial_scenes import random_boxes
 import jimpact as ji
 
 # v+ by method 'time' at rtol 1e-11, k = 1, eta = 1.5, mu = .3, by name and e
-EDGE = [0.7057231279, 0.3448930544, 0.0365790838, -2.9887916746, -0.3493685294, -0.0909271875]
+EDGE = [
+    0.7057231279,
+    0.3448930544,
+    0.0365790838,
+    -2.9887916746,
+    -0.3493685294,
+    -0.0909271875,
+]
 
 
-FLAT = [0.6299348115, 0.1993363367, 0.2798615911, 0.0212017465, -0.394785253, 0.0517198202]
+FLAT = [
+    0.6299348115,
+    0.1993363367,
+    0.2798615911,
+    0.0212017465,
+    -0.394785253,
+    0.0517198202,
+]
 
 
 EVENT_BY_EVENT = {
     ("edge", 0.3): EDGE,
-    ("edge", 0.0): [0.7669362833, 0.3074755598, -0.2007867887, -2.4982569377, 0.0, -0.1149629959],
+    ("edge", 0.0): [
+        0.7669362833,
+        0.3074755598,
+        -0.2007867887,
+        -2.4982569377,
+        0.0,
+        -0.1149629959,
+    ],
     ("flat", 0.3): FLAT,
     ("flat", 0.0): [0.7126974225, 0.2149277049, 0.0, 0.0, 0.0, 0.0798893306],
 }
@@ -81,14 +102,19 @@ def test_forces_gaps_and_exponents():
     cases = [
         (ji.Hertz(1.0), [-0.04134429, 0.04313068, 0.9982136]),
         (ji.KelvinVoigt(2.0, 0.5), [0.07501565, 0.27741732, 0.64756704]),
-        (ji.Bistiffness(1.0, jnp.array([1.3, 1.7]), 0.6), [0.171364, 0.18514237, 0.64349363]),
+        (
+            ji.Bistiffness(1.0, jnp.array([1.3, 1.7]), 0.6),
+            [0.171364, 0.18514237, 0.64349363],
+        ),
     ]
     for force, expected in cases:
         out = ji.impact(ji.Compliant(force, method="implicit"), scene, [1.0, 0.0, 0.0])
         np.testing.assert_allclose(out.velocity, expected, atol=1.5 * DEFAULT_RTOL)
         assert out.status == 0
     far = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 10.0])  # one pair after the other
-    out = ji.impact(ji.Compliant(ji.Hertz(1.0), method="implicit"), far, [1.0, 0.0, 0.0])
+    out = ji.impact(
+        ji.Compliant(ji.Hertz(1.0), method="implicit"), far, [1.0, 0.0, 0.0]
+    )
     np.testing.assert_allclose(out.velocity, [0.0, 0.0, 1.0], atol=1.5 * DEFAULT_RTOL)
 
 
@@ -97,10 +123,14 @@ def test_derivatives():
     ball = ji.chain([1.0], wall=True)
 
     def after(e):
-        return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), ball, [1.0]).velocity[0]
+        return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), ball, [1.0]).velocity[
+            0
+        ]
 
     assert jax.jacfwd(after)(0.0) == pytest.approx(-1.0, abs=5e-4)
-    with pytest.raises(NotImplementedError, match="must be 'time' for second derivatives"):
+    with pytest.raises(
+        NotImplementedError, match="must be 'time' for second derivatives"
+    ):
         jax.hessian(after)(0.5)
 
 
@@ -125,7 +155,9 @@ def test_reverse_mode_is_the_forward_one():
 
     def total(mass):
         law = ji.LZB(0.3, 1.0, 1.5, friction=0.3, method="implicit")
-        return ji.impact(law, ji.Scene(mass, scene.normals, scene.tangents), v).velocity.sum()
+        return ji.impact(
+            law, ji.Scene(mass, scene.normals, scene.tangents), v
+        ).velocity.sum()
 
     change = jnp.asarray(np.random.default_rng(0).normal(size=(6, 6)))
     change = change + change.T
@@ -146,7 +178,15 @@ def test_agrees_with_an_independent_integration(contacts):
         law = ji.LZB(e, k, 1.5, friction=mu, method="implicit", rtol=TIGHT)
         return ji.impact(law, ji.Scene(mass, normals, tangents), v)
 
-    names = ("mass", "normals", "tangents", "velocity", "restitution", "friction", "stiffness")
+    names = (
+        "mass",
+        "normals",
+        "tangents",
+        "velocity",
+        "restitution",
+        "friction",
+        "stiffness",
+    )
     out = jax.jit(jax.vmap(one))(*(held[name] for name in names))
     assert not np.asarray(out.status).any()
     error = np.abs(out.velocity - held["after"]).max(axis=1)
@@ -161,7 +201,9 @@ def test_history_is_that_of_the_other_method():
     h = ji.history(law, ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0], samples=6)
     np.testing.assert_allclose(h.maximum_force, [0.89726283, 0.54923729], rtol=1e-3)
     np.testing.assert_allclose(h.force[1:3, 0], [0.85873828, 0.17296348], rtol=2e-2)
-    np.testing.assert_allclose(h.velocity[-1], [-0.27931205, -0.04382761, 0.45565576], atol=1e-6)
+    np.testing.assert_allclose(
+        h.velocity[-1], [-0.27931205, -0.04382761, 0.45565576], atol=1e-6
+    )
     assert h.status == 0
     assert h.force[-1, 0] == 0
 

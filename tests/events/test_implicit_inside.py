@@ -33,7 +33,9 @@ def test_reverse_mode_of_many_numbers():
     gradient, status = jax.grad(first, has_aux=True)(masses)
     assert gradient @ change == pytest.approx(float(forward), rel=1e-8)
     assert status == CODE["ok"]
-    with pytest.raises(NotImplementedError, match="must be 'time' for second derivatives"):
+    with pytest.raises(
+        NotImplementedError, match="must be 'time' for second derivatives"
+    ):
         jax.jacfwd(jax.grad(lambda mass: first(mass)[0]))(masses)
 
 
@@ -43,7 +45,9 @@ def test_tangents_of_the_impulses_of_a_step():
     spread = rng.normal(size=(6, 6)) / 4
     k, two = jnp.asarray(np.eye(6) + spread @ spread.T)[..., None], jnp.ones((2, 1))
     velocity = jnp.array([0.3, -1.0, 2.0, -1.0, 0.1, 0.05])[:, None]
-    given = StepProblem(Dense(k), velocity, two, two * 0.5, 0.4 * two, descent_lengths(k, 2))
+    given = StepProblem(
+        Dense(k), velocity, two, two * 0.5, 0.4 * two, descent_lengths(k, 2)
+    )
     given = given._replace(unloading=jnp.array([[0.5], [0.0]]))
     change = jax.tree.map(
         lambda x: jnp.asarray(rng.normal(size=x.shape) * (np.asarray(x) != 0)), given
@@ -54,7 +58,9 @@ def test_tangents_of_the_impulses_of_a_step():
     def impulses(step):
         q = jnp.zeros((6, 1))
         for _ in range(10):
-            q, left = exactly(jax.tree.map(lambda a, b: a + step * b, given, change), q, fine)
+            q, left = exactly(
+                jax.tree.map(lambda a, b: a + step * b, given, change), q, fine
+            )
         assert left < 1e-13
         return q
 
@@ -64,7 +70,9 @@ def test_tangents_of_the_impulses_of_a_step():
     assert slides == pytest.approx(0.4 * q[0, 0])
     assert sticks < 0.39
     _, (rate, _) = jax.jvp(lambda p: solve(p, q, fine), (given,), (change,))
-    np.testing.assert_allclose(rate, (impulses(1e-5) - impulses(-1e-5)) / 2e-5, atol=1e-8)
+    np.testing.assert_allclose(
+        rate, (impulses(1e-5) - impulses(-1e-5)) / 2e-5, atol=1e-8
+    )
 
 
 def test_slopes_of_a_queue_are_those_alone():
@@ -72,7 +80,9 @@ def test_slopes_of_a_queue_are_those_alone():
     scene, each = ji.chain([1.0], wall=True), jnp.linspace(0.0, 0.9, 2 * SLOTS_IN_SPACE)
 
     def after(e):
-        return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), scene, [1.0]).velocity[0]
+        return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), scene, [1.0]).velocity[
+            0
+        ]
 
     slopes = jax.vmap(jax.jacfwd(after))(each)
     np.testing.assert_allclose(slopes, -1.0, atol=1e-3)
@@ -80,7 +90,11 @@ def test_slopes_of_a_queue_are_those_alone():
 
 def test_auto_leaves_several_contacts_in_space_to_it():
     """Exact: one contact, and all without friction, whatever tangents the scene has."""
-    for name, method in (("corner", "time"), ("edge", "implicit"), ("legs", "implicit")):
+    for name, method in (
+        ("corner", "time"),
+        ("edge", "implicit"),
+        ("legs", "implicit"),
+    ):
         scene, v = pressed(name)
         assert method_for("auto", contact_of(scene, v), True) == method, name
         assert method_for("auto", contact_of(scene, v), False) == "time", name
@@ -90,7 +104,9 @@ def test_auto_leaves_several_contacts_in_space_to_it():
 
 def test_impulses_of_a_step():
     """Slip beyond the cone, stick within it, a contact whose unloading takes its force away."""
-    k = jnp.diag(jnp.array([1.0, 1.0, 2.0, 2.0]))[..., None]  # two contacts in the plane
+    k = jnp.diag(jnp.array([1.0, 1.0, 2.0, 2.0]))[
+        ..., None
+    ]  # two contacts in the plane
     lengths = descent_lengths(k, 2)
     np.testing.assert_allclose(lengths[:, 0], [1.0, 1.0, 0.5, 0.5])
     load, zero = jnp.ones((2, 1)), jnp.zeros((2, 1))
@@ -117,9 +133,16 @@ def test_sweeps_of_contacts_that_stick_end_soon():
 
 def test_an_impact_in_a_batch_is_what_it_is_alone():
     """Its sweeps end where it is right, not where the slowest of the batch is."""
-    k = jnp.stack([jnp.eye(4).at[2, 3].set(c).at[3, 2].set(c) for c in (0.5, 0.999)], axis=-1)
-    velocity, one = jnp.array([[0.0], [0.0], [1.0], [0.3]]) * jnp.ones((1, 2)), jnp.ones((2, 2))
-    problem = StepProblem(Dense(k), velocity, one, 0 * one, 2 * one, jnp.full((4, 2), 0.4))
+    k = jnp.stack(
+        [jnp.eye(4).at[2, 3].set(c).at[3, 2].set(c) for c in (0.5, 0.999)], axis=-1
+    )
+    velocity, one = (
+        jnp.array([[0.0], [0.0], [1.0], [0.3]]) * jnp.ones((1, 2)),
+        jnp.ones((2, 2)),
+    )
+    problem = StepProblem(
+        Dense(k), velocity, one, 0 * one, 2 * one, jnp.full((4, 2), 0.4)
+    )
     alone = jax.tree.map(lambda x: x[..., :1], problem)
     (both, _), (single, left) = (
         solve(p, 0 * p.velocity, 0.2 + 0 * p.load[:1]) for p in (problem, alone)
@@ -135,7 +158,9 @@ def test_redundant_contacts_keep_descent_lengths_safe():
     k = factor.T @ factor
     d = np.asarray(descent_lengths(jnp.asarray(k)[..., None], 4))[:, 0]
     assert np.linalg.eigvalsh(np.diag(1 / d) - k).min() > -1e-12
-    d = np.asarray(descent_lengths(jnp.asarray(k)[..., None], 4, friction_only=True))[:, 0]
+    d = np.asarray(descent_lengths(jnp.asarray(k)[..., None], 4, friction_only=True))[
+        :, 0
+    ]
     assert np.linalg.eigvalsh((np.diag(1 / d) - k)[4:, 4:]).min() > -1e-12
     # one contact in the plane: its tangential row alone
     coupled = jnp.array([[1.0, 0.8], [0.8, 2.0]])[..., None]
@@ -177,7 +202,9 @@ def test_what_the_sweeps_of_a_step_leave_is_part_of_its_error():
     )
     loaded, velocity = jnp.ones((2, 1)), jnp.array([[0.0], [0.0], [1e-4], [-1e-4]])
     after, error = flow.substep(flow.start(loaded, velocity), jnp.full((1, 1), 0.3))
-    slip = np.abs(after.velocity[2:]).max()  # it takes impulses of .1, and the discs have .3
+    slip = np.abs(
+        after.velocity[2:]
+    ).max()  # it takes impulses of .1, and the discs have .3
     assert slip > 2 * float(flow.tolerance[0, 0])
     assert error > 0.8 * slip
 
@@ -216,7 +243,9 @@ def test_the_moment_of_a_turn_counts():
         gamma = before + part * (after - before)
         rate = np.where(gamma > 0, gamma / e**2 if loaded else 0.0, gamma)
         way = -h * np.array([1.0, 2.0]) * rate.mean(axis=0)
-        x, first, last = (jnp.asarray(y)[:, None] for y in (loaded + 0 * before, before, after))
+        x, first, last = (
+            jnp.asarray(y)[:, None] for y in (loaded + 0 * before, before, after)
+        )
         none = jnp.zeros((2, 1), bool)
         half = flow.moved(x, first, h / 2, none)
         end = flow.moved(half, last, h / 2, none)
@@ -227,9 +256,15 @@ def test_the_moment_of_a_turn_counts():
 def test_a_chain_needs_its_two_diagonals_only():
     """Descent in a chain is safe, and its product that of the matrix."""
     off = jnp.array([-0.9, -0.2, -0.5, -0.6])[:, None]
-    k = np.eye(5) + np.diag(np.asarray(off)[:, 0], 1) + np.diag(np.asarray(off)[:, 0], -1)
+    k = (
+        np.eye(5)
+        + np.diag(np.asarray(off)[:, 0], 1)
+        + np.diag(np.asarray(off)[:, 0], -1)
+    )
     d = np.asarray(implicit_steps.descent_of(Chain(off), 5))[:, 0]
     assert np.linalg.eigvalsh(np.diag(1 / d) - k).min() > 0
     assert d.min() > 0.4
     f = jnp.arange(5.0)[:, None] ** 2
-    np.testing.assert_allclose(Chain(off).times(f)[:, 0], k @ np.arange(5.0) ** 2, rtol=1e-14)
+    np.testing.assert_allclose(
+        Chain(off).times(f)[:, 0], k @ np.arange(5.0) ** 2, rtol=1e-14
+    )

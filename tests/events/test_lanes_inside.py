@@ -45,7 +45,11 @@ def test_a_loop_is_traced_once_at_the_batch_that_is_compiled(traces, function, b
 
 
 def plane():
-    return ji.LZB(0.9, friction=0.3), ji.Block(0.2, 0.6).scene([0.0, 0.3, 0.0]), [0.2, -1.0, 0.1]
+    return (
+        ji.LZB(0.9, friction=0.3),
+        ji.Block(0.2, 0.6).scene([0.0, 0.3, 0.0]),
+        [0.2, -1.0, 0.1],
+    )
 
 
 def space():
@@ -67,5 +71,7 @@ def test_results_are_as_stated(monkeypatch, case):
 
         monkeypatch.setattr(program, "__call__", compared)
     v = jnp.asarray(v, float)
-    jax.jit(jax.vmap(lambda k: ji.impact(law, scene, k * v).velocity)).lower(jnp.ones(41))
+    jax.jit(jax.vmap(lambda k: ji.impact(law, scene, k * v).velocity)).lower(
+        jnp.ones(41)
+    )
     assert seen == [True]

@@ -28,7 +28,9 @@ def test_a_row_of_balls_ends_as_a_block_or_apart():
     assert programs.names(status) == ["plastic_limit", "ok"]
     np.testing.assert_allclose(after[0], 1 / ROW, rtol=1e-12)
     apart = [-0.00867063, 0.02377687, 0.03518528, 0.03571521, 0.09872827, 0.61727936]
-    np.testing.assert_allclose(after[1][jnp.array([0, 1, 8, 9, 10, 11])], apart, atol=2e-8)
+    np.testing.assert_allclose(
+        after[1][jnp.array([0, 1, 8, 9, 10, 11])], apart, atol=2e-8
+    )
 
 
 @pytest.mark.release

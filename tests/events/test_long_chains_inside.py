@@ -20,9 +20,13 @@ def test_a_look_ahead_concludes_nothing_without_a_margin():
     scene, m = ji.chain([1.0] * ROW), ROW - 1
     contact = contact_of(scene, jnp.zeros(ROW).at[0].set(1.0))
     dynamics = ji.LZB(0.5).dynamics(contact)
-    flow, modes, y = flow_of(jax.tree.map(lambda x: x[..., None], dynamics.problem), 1.5, "chain")
+    flow, modes, y = flow_of(
+        jax.tree.map(lambda x: x[..., None], dynamics.problem), 1.5, "chain"
+    )
     every, asked = jnp.ones((m, 1), bool), jnp.ones((1, 1), bool)
-    part = (jnp.arange(ROW - 1.0, 0.0, -1.0) / ROW)[:, None]  # p_j in the limit, by momentum
+    part = (jnp.arange(ROW - 1.0, 0.0, -1.0) / ROW)[
+        :, None
+    ]  # p_j in the limit, by momentum
     share = 2 * part  # in units of Q / sqrt(W_jj), of the inverse mass of both balls
     look = jax.jit(comes_to_rest)
     assert not look(flow, modes, y, every, share, asked)

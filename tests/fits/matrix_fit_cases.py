@@ -27,12 +27,16 @@ after = jax.jit(
 
 def shots(matrix, noise=0.0, seed=0, pre=PRE):
     post = np.asarray(after(jnp.asarray(matrix), jnp.asarray(pre)))
-    return ji.Experiments(pre, post + noise * np.random.default_rng(seed).normal(size=post.shape))
+    return ji.Experiments(
+        pre, post + noise * np.random.default_rng(seed).normal(size=post.shape)
+    )
 
 
 def fitted(data, start=START, **options):
     free = options.pop("free", True)
-    return fit(RestitutionMatrix(start), CHAIN, data, {"matrix": free}, starts=2, **options)
+    return fit(
+        RestitutionMatrix(start), CHAIN, data, {"matrix": free}, starts=2, **options
+    )
 
 
 # the unconstrained minimum of these data creates energy

@@ -24,10 +24,15 @@ def shots(**errors) -> ji.Experiments:
 def test_independent_errors_are_a_covariance():
     stated = ji.fit(ji.Newton(0.8), PAIR, shots(sigma=0.02, sigma_pre=0.01))
     diagonal = np.diag([1e-4, 1e-4, 4e-4, 4e-4])
-    for covariance in (np.tile(diagonal, (COUNT, 1, 1)), np.kron(np.eye(COUNT), diagonal)):
+    for covariance in (
+        np.tile(diagonal, (COUNT, 1, 1)),
+        np.kron(np.eye(COUNT), diagonal),
+    ):
         result = ji.fit(ji.Newton(0.8), PAIR, shots(covariance=covariance))
         np.testing.assert_allclose(result.value, stated.value, rtol=1e-9)
-        np.testing.assert_allclose(result.standard_error, stated.standard_error, rtol=1e-9)
+        np.testing.assert_allclose(
+            result.standard_error, stated.standard_error, rtol=1e-9
+        )
 
 
 def law(e: float) -> np.ndarray:
@@ -36,7 +41,9 @@ def law(e: float) -> np.ndarray:
     return common + e * np.outer([-0.6, 0.4], [1.0, -1.0])
 
 
-def errors_in_both(data: ji.Experiments, covariance: np.ndarray, shots: list[int]) -> np.ndarray:
+def errors_in_both(
+    data: ji.Experiments, covariance: np.ndarray, shots: list[int]
+) -> np.ndarray:
     """(e, standard error, chi^2) of the least joint misfit, over e and all true velocities."""
     pre, post = np.asarray(data.pre), np.asarray(data.post)
     measured = np.concatenate([pre, post], axis=1)[shots].ravel()
@@ -49,7 +56,9 @@ def errors_in_both(data: ji.Experiments, covariance: np.ndarray, shots: list[int
         return np.linalg.solve(factor, measured - expected)
 
     start = np.append(0.5, pre[shots].ravel())
-    end = least_squares(misfit, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    end = least_squares(
+        misfit, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     error = np.sqrt(np.linalg.inv(end.jac.T @ end.jac)[0, 0])
     return np.array([end.x[0], error, 2 * end.cost])
 
@@ -64,7 +73,9 @@ def test_fit_is_that_of_errors_in_both_variables():
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     # the same without shot 2: its errors leave the covariance
     without = ji.leave_one_out(result).value[1, 0]
-    np.testing.assert_allclose(without, errors_in_both(data, whole, [0, 2, 3])[0], rtol=1e-4)
+    np.testing.assert_allclose(
+        without, errors_in_both(data, whole, [0, 2, 3])[0], rtol=1e-4
+    )
     assert 0.5 < ji.bootstrap(result, 60).value.std() / result.standard_error[0] < 1.5
     # one bracket of the profile, where the misfit is larger by 3.84
     ((low, _),) = ji.profile(result)[0].intervals
@@ -95,7 +106,9 @@ def test_errors_before_do_not_draw_e_down():
 
 def test_derivatives_of_a_problem_with_errors_before():
     """The gradient is exact beside differences; a second derivative is refused."""
-    problem = ji.FitProblem.from_shots(ji.Newton(0.8), PAIR, shots(sigma=0.2, sigma_pre=0.3))
+    problem = ji.FitProblem.from_shots(
+        ji.Newton(0.8), PAIR, shots(sigma=0.2, sigma_pre=0.3)
+    )
     at = jnp.array([0.55])
     slope = jax.grad(problem.log_density)(at)[0]
     density = [float(problem.log_density(at + h)) for h in (-1e-5, 1e-5)]
@@ -110,7 +123,9 @@ def test_momentum_is_judged_by_the_covariance():
     data = {"pre": PRE + offset, "post": POST}
     against = ONE.copy() * 0.01
     alarmed = ji.fit(
-        ji.Newton(0.8), PAIR, ji.Experiments(**data, covariance=np.tile(against, (COUNT, 1, 1)))
+        ji.Newton(0.8),
+        PAIR,
+        ji.Experiments(**data, covariance=np.tile(against, (COUNT, 1, 1))),
     )
     assert any("conservation of momentum" in line for line in alarmed.warnings)
     loose = ji.Experiments(**data, covariance=np.tile(1e-2 * np.eye(4), (COUNT, 1, 1)))
@@ -127,8 +142,14 @@ def test_momentum_is_judged_by_the_covariance():
         ({"covariance": np.full((COUNT, 4, 4), np.nan)}, "finite"),
         ({"covariance": np.tile(-ONE, (COUNT, 1, 1))}, "positive definite"),
         ({"covariance": np.ones((COUNT, 4, 4))}, "positive definite"),
-        ({"covariance": np.tile(ONE + 1e-5 * np.eye(4, k=1), (COUNT, 1, 1))}, "symmetric"),
-        ({"covariance": np.kron(np.ones((4, 4)) - 2 * np.eye(4), -ONE)}, "positive definite"),
+        (
+            {"covariance": np.tile(ONE + 1e-5 * np.eye(4, k=1), (COUNT, 1, 1))},
+            "symmetric",
+        ),
+        (
+            {"covariance": np.kron(np.ones((4, 4)) - 2 * np.eye(4), -ONE)},
+            "positive definite",
+        ),
     ],
 )
 def test_bad_covariances_are_refused(errors, words):

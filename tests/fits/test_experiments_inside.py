@@ -50,13 +50,17 @@ def test_incomplete_shots_are_neither_judged_nor_corrected():
     scene = ji.chain([1.0, 1.0])
     assert np.isnan(data.momentum_excess(scene)[0, 0])
     corrected = data.momentum_corrected(scene)
-    np.testing.assert_allclose(corrected.post, [[0.0, np.nan], [-0.05, 1.05]], atol=1e-15)
+    np.testing.assert_allclose(
+        corrected.post, [[0.0, np.nan], [-0.05, 1.05]], atol=1e-15
+    )
     assert "shot 2: 1.1000" in data_defects(data, scene)[0]
 
 
 def test_defects_are_held_against_sigma():
     scene = ji.chain([1.0, 1.0])
-    inside = ji.Experiments([1.0, 0.0], [0.1, 0.95], sigma=0.02)  # excess 0.05, error 0.028
+    inside = ji.Experiments(
+        [1.0, 0.0], [0.1, 0.95], sigma=0.02
+    )  # excess 0.05, error 0.028
     outside = ji.Experiments([1.0, 0.0], [0.1, 0.95], sigma=0.01)
     assert data_defects(inside, scene) == []
     assert len(data_defects(outside, scene)) == 1
@@ -80,7 +84,9 @@ def test_many_defects_are_summed_up():
 def test_momentum_lost_from_both_ends_is_seen():
     """Signed excesses cancel; as shares of the momentum they do not."""
     pre = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]] * 4)
-    exact = np.array([ji.impact(ji.Newton(0.9), CHAIN, v).velocity for v in pre[:2]] * 4)
+    exact = np.array(
+        [ji.impact(ji.Newton(0.9), CHAIN, v).velocity for v in pre[:2]] * 4
+    )
     noise = 0.003 * np.random.default_rng(0).normal(size=pre.shape)
     assert data_defects(ji.Experiments(pre, exact + noise), CHAIN) == []
     (line,) = data_defects(ji.Experiments(pre, 0.8 * exact + noise), CHAIN)
@@ -113,6 +119,8 @@ def test_honest_momentum_is_seldom_reported():
 def test_kinds_of_findings_are_those_of_the_table():
     folder = Path(ji.__file__).parent / "fits"
     used = set(
-        re.findall(r'Finding\(\s*"(\w+)"', "".join(p.read_text() for p in folder.glob("*.py")))
+        re.findall(
+            r'Finding\(\s*"(\w+)"', "".join(p.read_text() for p in folder.glob("*.py"))
+        )
     )
     assert used == set(KINDS)

@@ -31,8 +31,12 @@ def newton_in_closed_form(post, weight, pre=SHOTS, scene=PAIR):
 
 
 def test_single_contact_newton_is_the_velocity_ratio():
-    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments([1.0, 0.0], [-0.1, 0.55]), starts=1)
-    np.testing.assert_allclose(found.law.restitution, 0.65, rtol=1e-8)  # -gamma+ / gamma-
+    found = ji.fit(
+        ji.Newton(0.9), PAIR, ji.Experiments([1.0, 0.0], [-0.1, 0.55]), starts=1
+    )
+    np.testing.assert_allclose(
+        found.law.restitution, 0.65, rtol=1e-8
+    )  # -gamma+ / gamma-
     assert found.law.restitution.shape == ()
     assert found.converged
 
@@ -47,7 +51,9 @@ def test_errors_from_the_residual_are_those_of_linear_regression():
     np.testing.assert_allclose(found.standard_error, [noise * error], rtol=1e-10)
     np.testing.assert_allclose(found.rms, np.sqrt(rest / 8), rtol=1e-10)
     half = stats.t.ppf(0.95, 7) * noise * error
-    np.testing.assert_allclose(found.confidence_interval(0.9), [[e - half, e + half]], rtol=1e-9)
+    np.testing.assert_allclose(
+        found.confidence_interval(0.9), [[e - half, e + half]], rtol=1e-9
+    )
     np.testing.assert_allclose(found.residual, post - found.predicted, atol=1e-15)
 
 
@@ -59,7 +65,9 @@ def test_given_errors_weigh_and_are_not_rescaled():
     np.testing.assert_allclose(found.value, [e], rtol=1e-10)
     np.testing.assert_allclose(found.standard_error, [error], rtol=1e-10)
     half = stats.norm.ppf(0.975) * error
-    np.testing.assert_allclose(found.confidence_interval(), [[e - half, e + half]], rtol=1e-9)
+    np.testing.assert_allclose(
+        found.confidence_interval(), [[e - half, e + half]], rtol=1e-9
+    )
 
 
 def test_missing_values_do_not_count():
@@ -68,7 +76,9 @@ def test_missing_values_do_not_count():
     e, error, rest = newton_in_closed_form(post, np.ones_like(post))
     found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
     np.testing.assert_allclose(found.value, [e], rtol=1e-10)
-    np.testing.assert_allclose(found.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-10)
+    np.testing.assert_allclose(
+        found.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-10
+    )
     assert found.degrees_of_freedom == 5
     assert np.isnan(found.residual[0, 1])
 
@@ -87,7 +97,10 @@ def reported(found):
 def test_data_that_another_law_made_are_reported():
     """One e for two contacts; without sigma the noise is what momentum shows."""
     pre = np.random.default_rng(0).uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
-    for scene, reason in ((BALLS, "noise that momentum"), (WALLED, "follow the velocities")):
+    for scene, reason in (
+        (BALLS, "noise that momentum"),
+        (WALLED, "follow the velocities"),
+    ):
         post = simulated(ji.Newton([0.9, 0.4]), scene, pre[:, : scene.size], noise=0.01)
         data = ji.Experiments(pre[:, : scene.size], post)
         assert reason in reported(ji.fit(ji.Newton(0.8), scene, data))
@@ -100,7 +113,10 @@ def test_lack_of_fit_is_reported_from_its_level_on():
     """F with 23 and 12 degrees of freedom: 12 shots of three balls, one momentum each, one e."""
     rng = np.random.default_rng(0)
     pre = rng.uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
-    exact, noise = simulated(ji.Newton(0.8), BALLS, pre), 0.01 * rng.normal(size=(12, 3))
+    exact, noise = (
+        simulated(ji.Newton(0.8), BALLS, pre),
+        0.01 * rng.normal(size=(12, 3)),
+    )
     momentum = np.repeat(noise.mean(axis=1, keepdims=True), 3, axis=1)
 
     def fit(times):
@@ -123,7 +139,10 @@ def test_honest_noise_breaks_no_momentum():
     assert ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)).warnings == ()
     broken = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post))
     assert "violate conservation of momentum" in reported(broken)
-    assert "; but the data violate conservation of momentum in all 24 shots" in broken.verdict
+    assert (
+        "; but the data violate conservation of momentum in all 24 shots"
+        in broken.verdict
+    )
 
 
 def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
@@ -151,7 +170,9 @@ def test_outliers_do_not_hide_each_other_from_a_robust_loss():
     for loss in ("huber", "student"):
         (line,) = (
             x
-            for x in ji.fit(ji.Newton(0.5), PAIR, data, search=ji.Search(loss=loss)).warnings
+            for x in ji.fit(
+                ji.Newton(0.5), PAIR, data, search=ji.Search(loss=loss)
+            ).warnings
             if x.startswith("Suspicious")
         )
         assert line.startswith("Suspicious: shots 10, 6, 3, which")
@@ -186,8 +207,14 @@ def test_robust_losses_minimize_what_they_say():
     problem = ji.FitProblem.from_shots(
         ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.01)
     )
-    huber = lambda u: np.where(np.abs(u) < 1.345, u**2 / 2, 1.345 * (np.abs(u) - 1.345 / 2))  # noqa: E731
-    student = lambda u: 2.5 * np.log1p(u**2 / 4)  # noqa: E731
+
+    def huber(u):
+        within = np.abs(u) < 1.345
+        return np.where(within, u**2 / 2, 1.345 * (np.abs(u) - 1.345 / 2))
+
+    def student(u):
+        return 2.5 * np.log1p(u**2 / 4)
+
     grid = np.linspace(0.4, 0.8, 4001)
     at_0, at_1 = (np.asarray(problem.residual([e])) for e in (0.0, 1.0))
     u = at_0 + grid[:, None] * (at_1 - at_0)  # linear in e
@@ -203,14 +230,20 @@ def test_the_scale_of_robust_losses_is_that_of_normal_errors():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05)
     post[1] += [0.8, -0.4]
     at_0 = simulated(ji.Newton(0.0), PAIR, SHOTS)
-    x, y = (simulated(ji.Newton(1.0), PAIR, SHOTS) - at_0).ravel(), (post - at_0).ravel()
+    x, y = (
+        (simulated(ji.Newton(1.0), PAIR, SHOTS) - at_0).ravel(),
+        (post - at_0).ravel(),
+    )
     e = x @ y / (x @ x)
     for _ in range(200):
         scale = np.median(np.abs(y - e * x)) / stats.norm.ppf(0.75)
         weight = np.minimum(1.0, 1.345 * scale / np.abs(y - e * x))
         e = (weight * x) @ y / ((weight * x) @ x)
     fitted = ji.fit(
-        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), search=ji.Search(loss="huber")
+        ji.Newton(0.9),
+        PAIR,
+        ji.Experiments(SHOTS, post),
+        search=ji.Search(loss="huber"),
     )
     np.testing.assert_allclose(fitted.value, [e], rtol=1e-5)
 
@@ -226,7 +259,9 @@ def test_shots_in_which_only_open_contacts_approach_are_reported():
     """By a law without gaps; with them nothing is wrong."""
     apart = ji.chain([1.0, 1.0], gaps=[1e-3])
     data = ji.Experiments(SHOTS, simulated(ji.Binary(0.8), apart, SHOTS), sigma=0.01)
-    assert "only open ones do" in reported(ji.fit(ji.Newton(0.9), apart, data, starts=1))
+    assert "only open ones do" in reported(
+        ji.fit(ji.Newton(0.9), apart, data, starts=1)
+    )
     assert "approaches" not in reported(ji.fit(ji.Binary(0.9), apart, data, starts=1))
 
 
@@ -238,7 +273,9 @@ def test_copies_of_a_shot_are_reported():
     times = np.array([[1.0]] * 5 + [[2.0]])
     scaled = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(times * pre, times * post))
     assert "All 6 shots are equal" in reported(scaled)
-    assert np.isnan([*scaled.standard_error, scaled.noise]).all()  # reproduced to the last digit
+    assert np.isnan(
+        [*scaled.standard_error, scaled.noise]
+    ).all()  # reproduced to the last digit
     reserved = "its error unknown; but the 6 shots are copies of one"
     assert scaled.verdict == f"restitution = 0.8, {reserved}."
     post[1:4] += [[0.01, -0.005], [0.02, 0.0], [0.0, 0.01]]
@@ -265,7 +302,9 @@ class Steep(ji.Newton):
         p, side, status = super().impulses(contact)
         e = self.restitution
         wrong = 1 + 1e6 * (e - jax.lax.stop_gradient(e))
-        return ji.Impulses(jnp.where(contact.gap_velocity < -1.8, wrong * p, p), side, status)
+        return ji.Impulses(
+            jnp.where(contact.gap_velocity < -1.8, wrong * p, p), side, status
+        )
 
 
 def fitted_without_the_third_shot(law):
@@ -302,7 +341,9 @@ def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
     problem = ji.FitProblem.from_observable(
         ji.Newton(0.9), lambda law: jnp.sqrt(0.0 * law.restitution)[None], [0.1]
     )
-    with pytest.raises(ValueError, match=r"at restitution = 0.9 those of 1 measured values \(1\)"):
+    with pytest.raises(
+        ValueError, match=r"at restitution = 0.9 those of 1 measured values \(1\)"
+    ):
         ji.fit(problem)
     with pytest.raises(
         ValueError,
@@ -317,7 +358,8 @@ def test_one_shot_that_gains_energy_is_named():
     rng = np.random.default_rng(8)
     before = rng.uniform(0.4, 0.9, 12)
     after = (
-        before[:, None] * np.array([1 - 0.9 * 2, 1 + 0.9]) / 3 + rng.normal(size=(12, 2)) * 0.004
+        before[:, None] * np.array([1 - 0.9 * 2, 1 + 0.9]) / 3
+        + rng.normal(size=(12, 2)) * 0.004
     )
     pre, scene = np.c_[before, np.zeros(12)], ji.chain([1.0, 2.0])
     quiet = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, after))
@@ -336,7 +378,9 @@ def test_turning_weighs_by_kinetic_energy():
     post = simulated(ji.Newton(0.5), scene, pre, noise=0.01)
     data = ji.Experiments(pre, post, units=["m/s", "rad/s"])
     found = ji.fit(ji.Newton(0.8), scene, data)
-    same = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, post, sigma=[[1.0, 10.0]] * 3))
+    same = ji.fit(
+        ji.Newton(0.8), scene, ji.Experiments(pre, post, sigma=[[1.0, 10.0]] * 3)
+    )
     np.testing.assert_allclose(found.value, same.value, rtol=1e-8)
     assert "same kinetic energy" in reported(found)
     assert " rad/s" in str(found)
@@ -394,7 +438,9 @@ def test_descent_comes_back_from_beyond_the_domain():
 
 def test_too_few_steps_are_reported():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
-    found = ji.fit(ji.Newton(0.9), PAIR, data, starts=1, search=ji.Search("adam", max_steps=3))
+    found = ji.fit(
+        ji.Newton(0.9), PAIR, data, starts=1, search=ji.Search("adam", max_steps=3)
+    )
     assert not found.converged
     assert found.found("not_converged")
     assert "NOT converged" in str(found)
@@ -420,7 +466,9 @@ def test_user_bounds_hold():
 
 def test_starts_are_reproducible():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05))
-    first, again = (ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(seed=3)) for _ in range(2))
+    first, again = (
+        ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(seed=3)) for _ in range(2)
+    )
     np.testing.assert_array_equal(first.value, again.value)
 
 
@@ -430,7 +478,9 @@ def test_three_measured_balls_with_one_e():
     np.testing.assert_allclose(found.value, [0.9911], atol=1e-4)
     np.testing.assert_allclose(found.rms, 0.0166, atol=5e-5)
     assert found.law.restitution.shape == ()
-    corrected = ji.fit(ji.LZB(0.95), BALLS, data.momentum_corrected(BALLS), free="restitution")
+    corrected = ji.fit(
+        ji.LZB(0.95), BALLS, data.momentum_corrected(BALLS), free="restitution"
+    )
     np.testing.assert_allclose(corrected.value, [0.9911], atol=1e-4)
     np.testing.assert_allclose(corrected.rms, 0.0089, atol=5e-5)
     assert corrected.warnings == ()
@@ -465,7 +515,9 @@ def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
     found = rank_2_of_3
     assert found.names == ("restitution[1]", "restitution[2]", "stiffness[2]")
     assert found.rank == 2
-    assert found.degrees_of_freedom == 3 - 2  # measured values less rank, not less parameters
+    assert (
+        found.degrees_of_freedom == 3 - 2
+    )  # measured values less rank, not less parameters
     assert np.isinf(found.standard_error).all()
     assert found.law.stiffness[0] == 1.0
     held, unseen = found.identifiability
@@ -473,7 +525,9 @@ def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
     assert all(name in unseen for name in found.names)
     (rank,) = (each for each in found.findings if each.kind == "undetermined")
     assert rank.numbers == {"rank": 2, "parameters": 3}
-    np.testing.assert_allclose(found.rms, 0.0422 / 3, rtol=1e-6)  # the momentum defect alone
+    np.testing.assert_allclose(
+        found.rms, 0.0422 / 3, rtol=1e-6
+    )  # the momentum defect alone
 
 
 @pytest.mark.slow
@@ -504,19 +558,26 @@ def test_the_interval_of_a_valley_is_reported(rank_2_of_3):
     for pieces, domain in zip(found.intervals(), np.transpose(found.bounds)):
         assert len(pieces) == 1
         assert (pieces[0][0] <= domain[0]) != (pieces[0][1] >= domain[1])
-    np.testing.assert_array_equal(found.confidence_interval(), [p[0] for p in found.intervals()])
+    np.testing.assert_array_equal(
+        found.confidence_interval(), [p[0] for p in found.intervals()]
+    )
 
 
 @pytest.mark.slow
 def test_all_stiffness_ratios_that_fit_are_found():
     """Three of them come apart alike; the first is not the true one."""
     truth = ji.LZB([0.95, 0.95], [1.0, 40.0])
-    data = ji.Experiments([1.0, 0, 0], simulated(truth, BALLS, [[1.0, 0, 0]])[0], sigma=1e-3)
+    data = ji.Experiments(
+        [1.0, 0, 0], simulated(truth, BALLS, [[1.0, 0, 0]])[0], sigma=1e-3
+    )
     free = {"restitution": [1, 1], "stiffness": [False, True]}
     found = ji.fit(ji.LZB([0.9, 0.9], [1.0, 1.0]), BALLS, data, free)
     ratios = sorted(start.value[1] for start in found.starts)
     np.testing.assert_allclose(ratios, [11.531, 31.732, 40.0], rtol=1e-3)
-    for reported in (found, replace(found, known_profiles=())):  # by profiles, by parabolas
+    for reported in (
+        found,
+        replace(found, known_profiles=()),
+    ):  # by profiles, by parabolas
         pieces = reported.intervals()[1]
         assert len(pieces) in (2, 3)
         assert any(low <= 40.0 <= high for low, high in pieces)
@@ -557,7 +618,9 @@ def test_parameters_by_name_and_criteria():
     assert e.intervals == known.intervals()[0]
     assert e.determined
     squares = np.sum((known.residual / 0.02) ** 2)
-    np.testing.assert_allclose([known.chi_squared, known.aic], [squares, squares + 2], rtol=1e-12)
+    np.testing.assert_allclose(
+        [known.chi_squared, known.aic], [squares, squares + 2], rtol=1e-12
+    )
     unknown = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
     assert np.isnan(unknown.chi_squared)
     likelihood = stats.norm.logpdf(unknown.residual, scale=unknown.rms).sum()
@@ -577,7 +640,9 @@ def test_further_shots_are_predicted_with_errors():
     for shots in (further, ji.Experiments(further, further)):
         out = found.predict(shots)
         np.testing.assert_allclose(out.velocity, at_0 + e * (at_1 - at_0), rtol=1e-9)
-        np.testing.assert_allclose(out.standard_error, error * np.abs(at_1 - at_0), rtol=1e-6)
+        np.testing.assert_allclose(
+            out.standard_error, error * np.abs(at_1 - at_0), rtol=1e-6
+        )
         assert (out.status == 0).all()
     head, first, *_, last = str(out).splitlines()
     assert head.split()[:5] == ["shot", "coordinate", "velocity", "std.", "error"]
@@ -587,7 +652,9 @@ def test_further_shots_are_predicted_with_errors():
     q = stats.norm.ppf(0.9)
     half = q * np.sqrt((error * (at_1 - at_0)) ** 2 + 0.02**2)
     band = found.predict(further, level=0.8)
-    np.testing.assert_allclose([band.velocity - band.low, band.high - band.velocity], [half] * 2)
+    np.testing.assert_allclose(
+        [band.velocity - band.low, band.high - band.velocity], [half] * 2
+    )
     own = found.predict(ji.Experiments(further, further, 0.1))
     np.testing.assert_allclose(own.noise, 0.1)
     unknown = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
@@ -597,10 +664,25 @@ def test_further_shots_are_predicted_with_errors():
     assert np.isinf(unseen.predict(further).standard_error).all()
     each = replace(found, law=ji.Newton([0.6]))
     for fit, shots, scene, message in (
-        (found, [[1.0, 0.0, 0.0]], None, r"`shots` must have shape \(K, 2\), .* \(1, 3\)"),
+        (
+            found,
+            [[1.0, 0.0, 0.0]],
+            None,
+            r"`shots` must have shape \(K, 2\), .* \(1, 3\)",
+        ),
         (found, [[np.nan, 0.0]], None, "`shots` must be finite, but has value nan"),
-        (found, further, BALLS, r"`scene` must have 2 velocities as the fit, but has 3 and 2"),
-        (each, further, WALLED, r"2 velocities as the fit and 1 contacts, .*but has 2 and 2"),
+        (
+            found,
+            further,
+            BALLS,
+            r"`scene` must have 2 velocities as the fit, but has 3 and 2",
+        ),
+        (
+            each,
+            further,
+            WALLED,
+            r"2 velocities as the fit and 1 contacts, .*but has 2 and 2",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             fit.predict(shots, scene)
@@ -611,17 +693,23 @@ def test_a_prior_weighs_like_one_more_measured_value():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
     data, mean, std = ji.Experiments(SHOTS, post, 0.02), 0.63, 0.01
     e, error, rest = newton_in_closed_form(post, np.full_like(post, 50.0))
-    found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": ji.Normal(mean, std)})
+    found = ji.fit(
+        ji.Newton(0.9), PAIR, data, priors={"restitution": ji.Normal(mean, std)}
+    )
     variance = 1 / (error**-2 + std**-2)
     best = variance * (e / error**2 + mean / std**2)
     squares = rest + (best - e) ** 2 / error**2 + (best - mean) ** 2 / std**2
     np.testing.assert_allclose(found.value, [best], rtol=1e-9)
     np.testing.assert_allclose(found.standard_error, [np.sqrt(variance)], rtol=1e-9)
-    np.testing.assert_allclose([found.chi_squared, found.aic], [squares, squares + 2], rtol=1e-9)
+    np.testing.assert_allclose(
+        [found.chi_squared, found.aic], [squares, squares + 2], rtol=1e-9
+    )
     assert found.degrees_of_freedom == 8 + 1 - 1
     half = stats.norm.ppf(0.975) * np.sqrt(variance)
     (profiled,) = ji.profile(found)
-    np.testing.assert_allclose(profiled.intervals, [(best - half, best + half)], rtol=1e-4)
+    np.testing.assert_allclose(
+        profiled.intervals, [(best - half, best + half)], rtol=1e-4
+    )
     problem = found.problem
     np.testing.assert_allclose(problem.residual([0.5])[-1], (0.5 - mean) / std)
     assert len(problem.residual([0.5])) == len(problem.jacobian([0.5])) == 9
@@ -641,12 +729,16 @@ def test_a_prior_that_the_data_contradict_is_named():
         mean = e + far * np.hypot(error, std)
         found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (mean, std)})
         assert (f"is {far:.2g} standard errors off" in reported(found)) is named
-        assert ("the prior of restitution contradicts the data" in found.verdict) is named
+        assert (
+            "the prior of restitution contradicts the data" in found.verdict
+        ) is named
 
 
 def test_what_only_a_prior_knows_is_said_to_be_its():
     law = ji.Newton([0.8, 0.6])
-    seen = ji.Experiments(PRE_3[:1], simulated(law, BALLS, PRE_3[:1]), 0.01)  # not contact 2
+    seen = ji.Experiments(
+        PRE_3[:1], simulated(law, BALLS, PRE_3[:1]), 0.01
+    )  # not contact 2
     found = ji.fit(law, BALLS, seen, starts=1, priors={"restitution[2]": (0.7, 0.05)})
     np.testing.assert_allclose(found["restitution[2]"][:2], [0.7, 0.05], rtol=1e-6)
     assert (found.rank, found.from_prior.tolist()) == (2, [False, True])
@@ -668,12 +760,20 @@ def test_bad_parts_of_a_scene(free, priors, message):
 
 
 def test_parts_of_scenes_belong_to_one_scene_and_one_kind_of_law():
-    one, own = ji.Experiments(SHOTS, SHOTS, 0.01), ji.Experiments(SHOTS, SHOTS, 0.01, [PAIR] * 4)
+    one, own = (
+        ji.Experiments(SHOTS, SHOTS, 0.01),
+        ji.Experiments(SHOTS, SHOTS, 0.01, [PAIR] * 4),
+    )
     dense = ji.Scene(np.diag([1.0, 2.0]), PAIR.normals)
     for law, scene, data, message in (
         (ji.Newton(0.5), None, own, "only where all shots have one `scene`"),
         (ji.Newton(0.5), dense, one, "`mass` only where that of `scene` is"),
-        (ji.RestitutionMatrix([[0.5]]), PAIR, one, "must not name `mass` with a RestitutionMatrix"),
+        (
+            ji.RestitutionMatrix([[0.5]]),
+            PAIR,
+            one,
+            "must not name `mass` with a RestitutionMatrix",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             ji.fit(law, scene, data, ("mass",), priors={"mass": (1.0, 0.1)})
@@ -713,7 +813,12 @@ def test_a_free_exponent():
 
 @pytest.mark.slow
 def test_a_contact_that_is_never_loaded_is_named():
-    pre = [[1.0, 0.0, 5.0], [2.0, 0.0, 5.0], [1.0, -1.0, 5.0], [3.0, 0.0, 9.0]]  # 3 runs away
+    pre = [
+        [1.0, 0.0, 5.0],
+        [2.0, 0.0, 5.0],
+        [1.0, -1.0, 5.0],
+        [3.0, 0.0, 9.0],
+    ]  # 3 runs away
     data = ji.Experiments(pre, simulated(ji.LZB([0.9, 0.5], [1.0, 1.0]), BALLS, pre))
     found = ji.fit(ji.LZB([0.8, 0.8], [1.0, 1.0]), BALLS, data)
     assert found.rank == 1
@@ -748,13 +853,19 @@ def test_the_problem_is_what_fit_solves():
     assert (problem.names, problem.start.tolist()) == (("restitution",), [0.9])
     np.testing.assert_array_equal(problem.domains, [[0.0, 1.0]])
     known = ~np.isnan(post)
-    np.testing.assert_allclose(problem.residual(found.value), -found.residual[known] / 0.05)
-    slope = simulated(ji.Newton(1.0), PAIR, SHOTS) - simulated(ji.Newton(0.0), PAIR, SHOTS)
+    np.testing.assert_allclose(
+        problem.residual(found.value), -found.residual[known] / 0.05
+    )
+    slope = simulated(ji.Newton(1.0), PAIR, SHOTS) - simulated(
+        ji.Newton(0.0), PAIR, SHOTS
+    )
     np.testing.assert_allclose(problem.jacobian([0.3])[:, 0], slope[known] / 0.05)
     expected = stats.norm.logpdf(found.residual[known], scale=0.05).sum()
     np.testing.assert_allclose(problem.log_density(found.value), expected)
     np.testing.assert_array_equal(problem.to_law([0.25]).restitution, 0.25)
-    unknown = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    unknown = ji.FitProblem.from_shots(
+        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post)
+    )
     gain = unknown.log_density([0.6]) - unknown.log_density([0.9])
     ratio = np.sum(unknown.residual([0.9]) ** 2) / np.sum(unknown.residual([0.6]) ** 2)
     np.testing.assert_allclose(gain, 3.5 * np.log(ratio))
@@ -764,10 +875,14 @@ def test_a_users_own_observable():
     """Heights of two bounces, and the same as a residual; errors by hand."""
     power, heights = jnp.array([2.0, 4.0]), np.array([0.49, 0.25])
     observe = lambda law: law.restitution**power  # noqa: E731
-    found = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), observe, heights, [0.01, 0.02]))
+    found = ji.fit(
+        ji.FitProblem.from_observable(ji.Newton(0.9), observe, heights, [0.01, 0.02])
+    )
     e = float(found.law.restitution)
     slope = np.array([2 * e, 4 * e**3]) / [0.01, 0.02]
-    np.testing.assert_allclose(found.standard_error, [1 / np.linalg.norm(slope)], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.standard_error, [1 / np.linalg.norm(slope)], rtol=1e-6
+    )
     assert abs(slope @ (found.residual / [0.01, 0.02])) < 1e-5 * np.linalg.norm(slope)
     assert found.experiments is None
     assert "2 measured values" in str(found)
@@ -776,7 +891,9 @@ def test_a_users_own_observable():
     def residual(law):
         return (observe(law) - heights) / np.array([0.01, 0.02])
 
-    same = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), residual, np.zeros(2), 1.0))
+    same = ji.fit(
+        ji.FitProblem.from_observable(ji.Newton(0.9), residual, np.zeros(2), 1.0)
+    )
     np.testing.assert_allclose(same.value, found.value, rtol=1e-7)
 
 
@@ -784,7 +901,9 @@ def test_a_users_own_observable():
 def test_an_observable_that_is_no_number_is_reported(lost):
     factor = jnp.array([np.nan, 1.0 if lost == 1 else np.nan])
     observe = lambda law: law.restitution * factor  # noqa: E731
-    found = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), observe, [0.5, 0.4], 0.01))
+    found = ji.fit(
+        ji.FitProblem.from_observable(ji.Newton(0.9), observe, [0.5, 0.4], 0.01)
+    )
     assert f"fails in {lost} of 2 values (1" in found.warnings[0]
     amount = "some" if lost == 1 else "all"
     assert found.verdict.startswith(f"Newton fails in {amount} of these data")
@@ -801,7 +920,9 @@ def test_an_observable_that_is_no_number_is_reported(lost):
 )
 def test_bad_observables(given, message):
     with pytest.raises(ValueError, match=message):
-        ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution[None], *given)
+        ji.FitProblem.from_observable(
+            ji.Newton(0.9), lambda law: law.restitution[None], *given
+        )
 
 
 def test_another_number_of_shots_is_served_by_the_same_program(caplog):
@@ -815,7 +936,9 @@ def test_another_number_of_shots_is_served_by_the_same_program(caplog):
         assert "advance_all" in caplog.text  # this is how it would be reported
     e, error, rest = newton_in_closed_form(post[:3], np.ones((3, 2)), pre[:3])
     np.testing.assert_allclose(few.value, [e], rtol=1e-9)
-    np.testing.assert_allclose(few.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-9)
+    np.testing.assert_allclose(
+        few.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-9
+    )
 
 
 class Even(Law):
@@ -842,9 +965,13 @@ class Shared(ji.Law):
 def test_profile_of_a_linear_problem_is_the_interval_of_linear_regression():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
     for sigma in (None, 0.02):
-        found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma), profiles=True)
+        found = ji.fit(
+            ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma), profiles=True
+        )
         (scan,) = found.profiles
-        np.testing.assert_allclose(scan.intervals, found.confidence_interval(), rtol=1e-5)
+        np.testing.assert_allclose(
+            scan.intervals, found.confidence_interval(), rtol=1e-5
+        )
         expected = ((scan.value - found.value) / found.standard_error) ** 2
         np.testing.assert_allclose(scan.deviance, expected, rtol=1e-5, atol=1e-6)
         assert scan.better is None
@@ -859,7 +986,9 @@ def test_profile_ends_at_a_bound_on_one_side():
     assert scan.intervals[0][1] == 1.0
     assert scan.words.startswith("at least 0.9")
     assert "at least 0.9" in str(found)  # a fit at a bound profiles of itself
-    (reported,) = ji.fit(ji.Newton(0.9), PAIR, found.experiments, profiles=False).intervals(0.9)
+    (reported,) = ji.fit(
+        ji.Newton(0.9), PAIR, found.experiments, profiles=False
+    ).intervals(0.9)
     np.testing.assert_allclose(reported, scan.intervals, rtol=1e-6)
 
 
@@ -875,7 +1004,9 @@ def test_profile_of_two_minima_is_a_union():
     found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root", starts=1)
     (scan,) = ji.profile(found, points=12)
     np.testing.assert_allclose(scan.intervals[1], 0.7, atol=0.02)
-    np.testing.assert_allclose(scan.intervals[0], -np.array(scan.intervals[1])[::-1], atol=1e-5)
+    np.testing.assert_allclose(
+        scan.intervals[0], -np.array(scan.intervals[1])[::-1], atol=1e-5
+    )
     assert " or " in scan.words
 
 
@@ -887,7 +1018,11 @@ class Cubic(Law):
 
     def impulses(self, contact):
         x = self.root
-        e = 0.4236 + 0.507 * (x**3 / 3 + x**2 / 8 - x / 8) - self.other * contact.gap_velocity
+        e = (
+            0.4236
+            + 0.507 * (x**3 / 3 + x**2 / 8 - x / 8)
+            - self.other * contact.gap_velocity
+        )
         change = -(1 + e) * contact.gap_velocity
         return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
 
@@ -908,13 +1043,18 @@ def test_a_lower_minimum_of_one_profile_is_that_of_all():
         assert scan.value[scan.deviance.argmin()] == value
         assert any(low <= value <= high for low, high in scan.intervals)
     warned = ji.fit(start, PAIR, data, ("root", "other"), starts=1, profiles=True)
-    assert "A profile found a lower minimum than the fit (root 0.8, other 0.05)" in reported(warned)
+    assert (
+        "A profile found a lower minimum than the fit (root 0.8, other 0.05)"
+        in reported(warned)
+    )
 
 
 def test_profile_of_a_valley_is_what_the_bounds_leave_of_it():
     """one * other = 0.5 with both at most 1, of a single shot that is reproduced exactly."""
     post = simulated(ji.Newton(0.5), PAIR, SHOTS[:1])
-    found = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-3), ("one", "other"))
+    found = ji.fit(
+        Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-3), ("one", "other")
+    )
     assert np.isinf(found.standard_error).all()
     for scan in ji.profile(found):
         width = 1.96 * 1e-3 / np.sqrt(2) / 0.5  # of the product, roughly
@@ -929,17 +1069,24 @@ def test_contours_of_linear_problems_are_ellipses():
     post = simulated(truth, BALLS, PRE_3, noise=0.01)
     names = ["matrix[1,1]", "matrix[2,2]"]
     for sigma in (0.01, None):
-        found = ji.fit(truth, BALLS, ji.Experiments(PRE_3, post, sigma), "matrix", starts=1)
+        found = ji.fit(
+            truth, BALLS, ji.Experiments(PRE_3, post, sigma), "matrix", starts=1
+        )
         region = ji.contour(found, *names, points=5)
         freedom = found.degrees_of_freedom
         limit = stats.chi2.ppf(0.95, 2) if sigma else 2 * stats.f.ppf(0.95, 2, freedom)
         np.testing.assert_allclose(region.limit, limit)
         at = [found.names.index(name) for name in names]
         inverse = np.linalg.inv(found.covariance[np.ix_(at, at)])
-        away = np.stack(np.meshgrid(region.x, region.y, indexing="ij"), axis=-1) - found.value[at]
+        away = (
+            np.stack(np.meshgrid(region.x, region.y, indexing="ij"), axis=-1)
+            - found.value[at]
+        )
         expected = np.einsum("abi,ij,abj->ab", away, inverse, away)
         seen = np.isfinite(region.deviance)
-        np.testing.assert_allclose(region.deviance[seen], expected[seen], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            region.deviance[seen], expected[seen], rtol=1e-5, atol=1e-6
+        )
         assert (expected[~seen] > limit).all()
         assert region.deviance[0, 2] > limit  # the picture holds the region
         assert len(ji.plot.contour(region).axes) == 1
@@ -947,16 +1094,22 @@ def test_contours_of_linear_problems_are_ellipses():
 
 def test_contour_of_a_valley_is_its_length():
     post = simulated(ji.Newton(0.5), PAIR, SHOTS[:1])
-    thin = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-4), ("one", "other"))
+    thin = ji.fit(
+        Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-4), ("one", "other")
+    )
     with pytest.raises(ValueError, match="falls between 4 values"):
         ji.contour(thin, "one", "other", points=4)
     data = ji.Experiments(SHOTS[:1], post, 0.05)
     found = ji.fit(Shared(0.9, 0.9), PAIR, data, ("one", "other"), profiles=False)
     region = ji.contour(found, "one", "other")
-    slope = simulated(ji.Newton(1.0), PAIR, SHOTS[:1]) - simulated(ji.Newton(0.0), PAIR, SHOTS[:1])
+    slope = simulated(ji.Newton(1.0), PAIR, SHOTS[:1]) - simulated(
+        ji.Newton(0.0), PAIR, SHOTS[:1]
+    )
     expected = np.sum(slope**2) * ((region.x[:, None] * region.y - 0.5) / 0.05) ** 2
     seen = np.isfinite(region.deviance)
-    np.testing.assert_allclose(region.deviance[seen], expected[seen], rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(
+        region.deviance[seen], expected[seen], rtol=1e-6, atol=1e-4
+    )
     assert (expected[~seen] > region.limit).all()
     for names, message in (
         (("one", "one"), "must differ"),
@@ -979,7 +1132,11 @@ def test_bad_profiles(options, message):
     with pytest.raises(ValueError, match=message):
         ji.profile(found, **options)
     robust = ji.fit(
-        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1, search=ji.Search(loss="huber")
+        ji.Newton(0.9),
+        PAIR,
+        ji.Experiments(SHOTS, SHOTS),
+        starts=1,
+        search=ji.Search(loss="huber"),
     )
     with pytest.raises(ValueError, match="by least squares"):
         ji.profile(robust)
@@ -987,19 +1144,28 @@ def test_bad_profiles(options, message):
 
 def test_fits_under_transformations_are_refused_in_words():
     data = ji.Experiments(SHOTS, SHOTS)
-    with pytest.raises(TypeError, match="`law` must hold numbers, but is traced: fits run on"):
+    with pytest.raises(
+        TypeError, match="`law` must hold numbers, but is traced: fits run on"
+    ):
         jax.grad(lambda e: ji.fit(ji.Newton(e), PAIR, data).rms)(0.5)
     with pytest.raises(TypeError, match="`post` must hold numbers, but is traced"):
         jax.vmap(lambda post: ji.Experiments(SHOTS, post).post)(jnp.ones((2, 4, 2)))
 
 
 def test_many_data_sets_are_fitted_as_one_by_one():
-    posts = [simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02, seed=k) for k in range(5)]
-    sets = [ji.Experiments(SHOTS[: 2 + k % 3], post[: 2 + k % 3]) for k, post in enumerate(posts)]
+    posts = [
+        simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02, seed=k) for k in range(5)
+    ]
+    sets = [
+        ji.Experiments(SHOTS[: 2 + k % 3], post[: 2 + k % 3])
+        for k, post in enumerate(posts)
+    ]
     for data, found in zip(sets, ji.fit_many(ji.Newton(0.9), PAIR, sets)):
         alone = ji.fit(ji.Newton(0.9), PAIR, data)
         np.testing.assert_allclose(found.value, alone.value, rtol=1e-9)
-        np.testing.assert_allclose(found.standard_error, alone.standard_error, rtol=1e-9)
+        np.testing.assert_allclose(
+            found.standard_error, alone.standard_error, rtol=1e-9
+        )
         assert found.degrees_of_freedom == alone.degrees_of_freedom
         assert found.converged
 
@@ -1025,11 +1191,15 @@ def test_bootstrap_scatters_as_much_as_the_standard_error():
     for sigma in (None, 0.03):
         found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma))
         many = ji.bootstrap(found, samples=400)
-        np.testing.assert_allclose(many.value.std(ddof=1), found.standard_error[0], rtol=0.15)
+        np.testing.assert_allclose(
+            many.value.std(ddof=1), found.standard_error[0], rtol=0.15
+        )
         np.testing.assert_allclose(many.value.mean(), found.value[0], atol=0.005)
         low, high = many.interval()[0]
         assert low < found.value[0] < high
-    np.testing.assert_array_equal(ji.bootstrap(found, samples=400, workers=1).value, many.value)
+    np.testing.assert_array_equal(
+        ji.bootstrap(found, samples=400, workers=1).value, many.value
+    )
     for workers in (0, -1, "all"):
         with pytest.raises(ValueError, match="`workers` must be an int >= 1"):
             ji.bootstrap(found, workers=workers)
@@ -1045,7 +1215,9 @@ def test_a_law_with_a_matrix_field():
     assert found.names == ("matrix[1,1]", "matrix[1,2]", "matrix[2,1]", "matrix[2,2]")
     np.testing.assert_allclose(found.law.matrix, truth.matrix, atol=1e-9)
     mask = [[True, False], [False, True]]
-    diagonal = ji.fit(Coupled(truth.matrix), BALLS, data, free={"matrix": mask}, starts=2)
+    diagonal = ji.fit(
+        Coupled(truth.matrix), BALLS, data, free={"matrix": mask}, starts=2
+    )
     assert diagonal.names == ("matrix[1,1]", "matrix[2,2]")
 
 
@@ -1069,7 +1241,9 @@ def test_a_fitted_law_that_fails_is_reported():
 def test_minima_that_fit_equally_well_are_reported():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS, noise=0.001))
     found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root")
-    np.testing.assert_allclose(sorted(s.value[0] for s in found.starts), [-0.7, 0.7], atol=2e-3)
+    np.testing.assert_allclose(
+        sorted(s.value[0] for s in found.starts), [-0.7, 0.7], atol=2e-3
+    )
     assert sum(s.count for s in found.starts) + found.lost_starts >= 8
     assert found.value[0] > 0  # the first start leads there
     assert found.found("several_minima")
@@ -1090,13 +1264,18 @@ def test_the_widest_precision_counts():
     found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, narrow), starts=1)
     assert found.law.restitution.dtype == jnp.float64
     mixed = ji.Experiments(jnp.asarray(SHOTS, jnp.float32), narrow, sigma=0.1)
-    assert ji.fit(ji.Newton(0.9), PAIR, mixed, starts=1).law.restitution.dtype == jnp.float64
+    assert (
+        ji.fit(ji.Newton(0.9), PAIR, mixed, starts=1).law.restitution.dtype
+        == jnp.float64
+    )
 
 
 def test_float32_works_and_says_so():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS)
     with jax.enable_x64(False):
-        found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 2.0]), ji.Experiments(SHOTS, post))
+        found = ji.fit(
+            ji.Newton(0.9), ji.chain([1.0, 2.0]), ji.Experiments(SHOTS, post)
+        )
     np.testing.assert_allclose(found.value, [0.6], rtol=1e-4)
     assert found.found("single_precision")
 
@@ -1145,7 +1324,9 @@ def test_bad_arguments(law, scene, data, options, message):
 def test_a_wrong_unit_is_said_before_the_search():
     """mm/s after: a warning, whatever the search then finds."""
     post = 1000.0 * simulated(ji.Newton(0.6), PAIR, SHOTS)
-    with pytest.warns(UserWarning, match=r"momentum after is 1000 times .* mm/s in one of"):
+    with pytest.warns(
+        UserWarning, match=r"momentum after is 1000 times .* mm/s in one of"
+    ):
         found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), starts=1)
     assert "the units are suspect" in found.reservations
 
@@ -1200,10 +1381,14 @@ def test_a_progress_bar_can_be_asked_for(capsys):
 def test_lack_of_fit_says_how_to_free_a_scalar_stiffness():
     """Three balls of unequal stiffness, by a law with one number; by two the report is calm."""
     balls = ji.chain([1.0, 1.0, 1.0])
-    pre = np.array([[1.0, 0.0, -0.5], [1.2, -0.1, -0.3], [0.8, 0.1, -0.7], [1.1, 0.0, 0.0]])
+    pre = np.array(
+        [[1.0, 0.0, -0.5], [1.2, -0.1, -0.3], [0.8, 0.1, -0.7], [1.1, 0.0, 0.0]]
+    )
     truth = ji.LZB([0.9, 0.9], [1.0, 3.0])
     post = np.array([ji.impact(truth, balls, v).velocity for v in pre])
-    data = ji.Experiments(pre, post + 0.001 * np.random.default_rng(2).normal(size=(4, 3)), 0.001)
+    data = ji.Experiments(
+        pre, post + 0.001 * np.random.default_rng(2).normal(size=(4, 3)), 0.001
+    )
     held = ji.fit(ji.LZB(0.9), balls, data, starts=1)
     (finding,) = [each for each in held.findings if each.kind == "lack_of_fit"]
     assert "`stiffness=[1, 1]`" in finding.line

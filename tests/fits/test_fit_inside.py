@@ -7,7 +7,13 @@ from fit_cases import BALLS, PAIR, PRE_3, SHOTS, THREE, Coupled, simulated, two_
 from scipy import optimize
 
 import jimpact as ji
-from jimpact.fits.parameters import LawInScene, bounds_of, checked_ties, free_parameters, tied
+from jimpact.fits.parameters import (
+    LawInScene,
+    bounds_of,
+    checked_ties,
+    free_parameters,
+    tied,
+)
 from jimpact.fits.report import Fit
 from jimpact.fits.solve import Damping
 from jimpact.tools.records import with_error
@@ -26,7 +32,10 @@ def test_entries_are_named_as_in_the_report():
     matrix, _ = free_parameters(Coupled(jnp.eye(2)), "matrix[2,1]")
     assert (matrix.names, matrix.groups) == (("matrix[2,1]",), ((2,),))
     for free, message in (
-        ("restitution[4]", r"`free` must name entries that the field has.*of shape \(3,\)"),
+        (
+            "restitution[4]",
+            r"`free` must name entries that the field has.*of shape \(3,\)",
+        ),
         ({"restitution[1]": 2}, "must map `restitution.1.` to True or False"),
         ("friction[1]", "must name parameters of Newton"),
     ):
@@ -37,7 +46,9 @@ def test_entries_are_named_as_in_the_report():
 
 
 def test_functions_cannot_be_saved(tmp_path):
-    observed = ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution, 0.5)
+    observed = ji.FitProblem.from_observable(
+        ji.Newton(0.9), lambda law: law.restitution, 0.5
+    )
     for problem, message in (
         (observed, "must be to shots to be saved"),
         (ji.FitProblem.from_shots(ji.Newton([0.5, 0.5]), BALLS, THREE, ties={"restitution[2]": two_thirds}), "must have no ties"),
@@ -73,15 +84,21 @@ def test_a_mass_with_a_prior_is_fitted_with_the_law():
     np.testing.assert_allclose(found.chi_squared, 2 * best.cost, rtol=1e-8)
     np.testing.assert_allclose(found.scene.mass, [1.0, found.value[1]])
     assert type(found.law) is type(found.problem.to_law(found.value)) is ji.Newton
-    np.testing.assert_allclose(found.predict(SHOTS).velocity, found.predicted, atol=1e-12)
+    np.testing.assert_allclose(
+        found.predict(SHOTS).velocity, found.predicted, atol=1e-12
+    )
     with pytest.raises(ValueError, match="`scene` must be left out"):
         found.predict(SHOTS, BALLS)
 
 
 def test_parts_of_a_scene_move_it():
     """A tilt of pi / 2 makes the tangent the normal; gaps and masses take the place of the old."""
-    wall = ji.Scene([1.0, 2.0, 0.5], [[0.0], [1.0], [0.2]], [[1.0], [0.0], [0.5]], gaps=[0.1])
-    parts = LawInScene(ji.Newton(0.5), mass=[3.0, 4.0, 5.0], gaps=[0.2], tilt=[np.pi / 2])
+    wall = ji.Scene(
+        [1.0, 2.0, 0.5], [[0.0], [1.0], [0.2]], [[1.0], [0.0], [0.5]], gaps=[0.1]
+    )
+    parts = LawInScene(
+        ji.Newton(0.5), mass=[3.0, 4.0, 5.0], gaps=[0.2], tilt=[np.pi / 2]
+    )
     moved = parts.in_scene(wall)
     np.testing.assert_allclose(moved.normals, wall.tangents, atol=1e-15)
     np.testing.assert_allclose(moved.tangents, -wall.normals, atol=1e-15)
@@ -98,9 +115,13 @@ def test_ties_follow_and_pass_their_errors_on():
     e, error = x @ y / (x @ x), 0.01 / np.sqrt(x @ x)
     assert found.names == ("restitution[1]",)
     np.testing.assert_allclose(found.law.restitution, [e, e * 2 / 3], rtol=1e-9)
-    np.testing.assert_allclose(found.tied["restitution[2]"], [e * 2 / 3, error * 2 / 3], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.tied["restitution[2]"], [e * 2 / 3, error * 2 / 3], rtol=1e-6
+    )
     np.testing.assert_allclose(found.standard_error, [error], rtol=1e-6)
-    assert f"restitution[2] = {with_error(e * 2 / 3, error * 2 / 3)} is tied" in str(found)
+    assert f"restitution[2] = {with_error(e * 2 / 3, error * 2 / 3)} is tied" in str(
+        found
+    )
     further = found.predict(2 * PRE_3)
     slope = 2 * x.reshape(PRE_3.shape)
     np.testing.assert_allclose(further.standard_error, error * np.abs(slope), atol=1e-9)
@@ -117,7 +138,10 @@ def test_ties_reach_across_fields_in_any_order():
         checked = checked_ties(law, dict(order))
         np.testing.assert_array_equal(tied(law, checked).stiffness, [1.0, 2.0, 2.25])
     chosen, _ = free_parameters(law, ("restitution", "stiffness"), ties=checked)
-    assert chosen.names == ("restitution[1]", "restitution[3]")  # stiffness[1]: only ratios matter
+    assert chosen.names == (
+        "restitution[1]",
+        "restitution[3]",
+    )  # stiffness[1]: only ratios matter
 
 
 @pytest.mark.slow
@@ -160,11 +184,15 @@ def test_a_kink_is_a_minimum_but_not_a_standard_error():
 
 def test_a_time_limit_ends_a_search():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02))
-    stopped = ji.fit(ji.Newton(0.9), PAIR, data, starts=1, search=ji.Search("adam", limit=0.0))
+    stopped = ji.fit(
+        ji.Newton(0.9), PAIR, data, starts=1, search=ji.Search("adam", limit=0.0)
+    )
     assert stopped.verdict.startswith("No answer")
     assert stopped.steps <= 8
 
 
 def test_as_many_starts_as_stated():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02))
-    assert [ji.fit(ji.Newton(0.9), PAIR, data, starts=n).start_count for n in (1, 3)] == [1, 3]
+    assert [
+        ji.fit(ji.Newton(0.9), PAIR, data, starts=n).start_count for n in (1, 3)
+    ] == [1, 3]

@@ -9,7 +9,14 @@ from spatial_scenes import NAMED
 import jimpact as ji
 
 # v+ by method 'time' at rtol 1e-11, k = 1, eta = 1.5, mu = .3, by name and e
-EDGE = [0.7057231279, 0.3448930544, 0.0365790838, -2.9887916746, -0.3493685294, -0.0909271875]
+EDGE = [
+    0.7057231279,
+    0.3448930544,
+    0.0365790838,
+    -2.9887916746,
+    -0.3493685294,
+    -0.0909271875,
+]
 
 
 def pressed(name):
@@ -55,7 +62,9 @@ def test_second_derivatives_of_a_fit_say_what_auto_is():
     def cost(x):
         return jnp.sum(problem.residual(x) ** 2)
 
-    with pytest.raises(NotImplementedError, match="or 'auto', which is 'implicit' for several"):
+    with pytest.raises(
+        NotImplementedError, match="or 'auto', which is 'implicit' for several"
+    ):
         jax.jit(jax.hessian(cost)).lower(jnp.asarray(problem.start))
 
 

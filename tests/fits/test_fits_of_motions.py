@@ -11,7 +11,9 @@ import jimpact as ji
 def test_fit_through_event_times():
     """Two balls dropped from 1 and .25 m: each bounces in the times of its own height."""
     heights = np.array([[1.0], [0.25]])
-    times = np.sqrt(2 * heights / G) * (1 + 2 * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)]))
+    times = np.sqrt(2 * heights / G) * (
+        1 + 2 * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)])
+    )
     given = (
         ji.System(ji.Column([1.0]), gravity=True),
         ji.Newton(0.7),
@@ -34,9 +36,16 @@ def test_a_motion_is_fitted_by_any_method():
     method = ji.TimeStepping(1e-3)
     pushed = ji.System(ji.Column([1.0]), gravity=True)
     start = [0.1], [0.0], 0.25
-    measured = ji.simulate(pushed, HARD, *start, samples=6, method=ji.EventDriven(rtol=1e-9)).q
+    measured = ji.simulate(
+        pushed, HARD, *start, samples=6, method=ji.EventDriven(rtol=1e-9)
+    ).q
     found = ji.fit_motion(
-        pushed, ji.Newton(0.7), measured, *start, method=ji.EventDriven(rtol=1e-9), max_events=20
+        pushed,
+        ji.Newton(0.7),
+        measured,
+        *start,
+        method=ji.EventDriven(rtol=1e-9),
+        max_events=20,
     )
     np.testing.assert_allclose(found.value, [0.8], atol=1e-7)
     with pytest.raises(NotImplementedError, match="time_stepping"):
@@ -48,12 +57,21 @@ def test_start_gravity_and_floor_of_a_motion_are_fitted_by_name():
     """A ball over a floor 5 cm above the zero of its heights, in two motions too."""
     rng, true = np.random.default_rng(0), ji.System(ji.Column([1.0]), gravity=9.7)
     starts, speeds = np.array([[1.0], [0.8]]), np.array([[0.3], [-0.2]])
-    seen = [ji.simulate(true, ji.Newton(0.8), *x, 1.5, samples=46).q for x in zip(starts, speeds)]
+    seen = [
+        ji.simulate(true, ji.Newton(0.8), *x, 1.5, samples=46).q
+        for x in zip(starts, speeds)
+    ]
     seen = np.array(seen) + 0.05
     seen += 1e-3 * rng.normal(size=seen.shape)
     ball, guess = ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.76)
     free = ("restitution", "q0", "v0", "gravity", "floor")
-    expected = {"restitution": 0.8, "q0[1]": 1.05, "v0[1]": 0.3, "gravity": 9.7, "floor": 0.05}
+    expected = {
+        "restitution": 0.8,
+        "q0[1]": 1.05,
+        "v0[1]": 0.3,
+        "gravity": 9.7,
+        "floor": 0.05,
+    }
     one = ji.fit_motion(ball, guess, seen[0], [1.03], [0.2], 1.5, free, sigma=1e-3)
     assert one.names == tuple(expected)
     assert one.rank == 5
@@ -65,7 +83,14 @@ def test_start_gravity_and_floor_of_a_motion_are_fitted_by_name():
         sigma=1e-3, bounds={"gravity": (9.0, 10.5)},
     )  # fmt: skip
     values = dict(zip(both.names, both.value))
-    assert set(values) == {"restitution", "v0[1,1]", "v0[2,1]", "q0[2,1]", "floor", "gravity"}
+    assert set(values) == {
+        "restitution",
+        "v0[1,1]",
+        "v0[2,1]",
+        "q0[2,1]",
+        "floor",
+        "gravity",
+    }
     for system, name, words in (
         (ji.System(ji.Column([1.0])), "gravity", "whose one potential is its weight"),
         (ji.System(lambda q: q, [1.0]), "floor", "over a floor at rest"),
@@ -102,7 +127,9 @@ def test_friction_is_fitted_through_a_motion():
         ji.System(ji.Dimer(0.01, 0.04), gravity=True),
         ([0.0, 0.1, 0.2], [0.5, 0.0, 0.0], 0.25),
     )
-    seen = np.asarray(ji.simulate(dimer, ji.Moreau(0.8, friction=0.2), *start, samples=41).q)
+    seen = np.asarray(
+        ji.simulate(dimer, ji.Moreau(0.8, friction=0.2), *start, samples=41).q
+    )
     noisy = seen + 1e-4 * np.random.default_rng(0).normal(size=seen.shape)
     free = ("restitution", "friction")
     guess = ji.Moreau(0.7, friction=0.3)

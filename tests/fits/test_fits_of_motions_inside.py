@@ -15,14 +15,16 @@ def test_several_motions_are_fitted_at_once(monkeypatch):
     """A motion of closed form in the place of the simulated one: heights of bounces, h e^2, ..."""
 
     def bounces(system, law, q0, v0, t_end, samples):
-        heights = (q0 + v0)[None] * (law.restitution**2) ** jnp.arange(samples, dtype=q0.dtype)[
-            :, None
-        ]
+        heights = (q0 + v0)[None] * (law.restitution**2) ** jnp.arange(
+            samples, dtype=q0.dtype
+        )[:, None]
         return SimpleNamespace(q=heights, status=jnp.asarray(0))
 
     monkeypatch.setattr(fitting_motion, "simulate", bounces)
     monkeypatch.setattr(fitting_motion, "LANES", 2)  # the second lot has one motion
-    own = np.array([1.0, 2.0, 0.5])[:, None, None] * 0.8 ** (2.0 * np.arange(4))[:, None]
+    own = (
+        np.array([1.0, 2.0, 0.5])[:, None, None] * 0.8 ** (2.0 * np.arange(4))[:, None]
+    )
     own[1, 2] = np.nan  # was not measured
     given = (
         ji.System(ji.Column([1.0]), gravity=True),

@@ -9,12 +9,18 @@ import jimpact as ji
 @pytest.mark.slow
 def test_a_correction_leaves_the_errors_before_in_what_it_conserves():
     """Generalized least squares of the velocity difference alone: a pair, its momentum corrected."""
-    m, sigma, before = np.array([1.0, 2.0]), np.array([0.02, 0.05]), np.array([0.05, 0.03])
+    m, sigma, before = (
+        np.array([1.0, 2.0]),
+        np.array([0.02, 0.05]),
+        np.array([0.05, 0.03]),
+    )
     scene, e = ji.chain(m), 0.5
     pre, post = np.array([[1.0, 0.0], [2.0, -1.0]]), np.array([[0.1, 0.5], [-0.9, 0.6]])
     errors = {"sigma": np.tile(sigma, (2, 1)), "sigma_pre": np.tile(before, (2, 1))}
     data = ji.Experiments(pre, post, **errors).momentum_corrected(scene)
-    jacobian = np.array([[m[0] - e * m[1], (1 + e) * m[1]], [(1 + e) * m[0], m[1] - e * m[0]]])
+    jacobian = np.array(
+        [[m[0] - e * m[1], (1 + e) * m[1]], [(1 + e) * m[0], m[1] - e * m[0]]]
+    )
     jacobian /= m.sum()
     moved = sigma**2 * m / (m**2 @ sigma**2)
     seen = np.array([-moved[1], moved[0]])  # blind to what the correction moves
@@ -25,7 +31,9 @@ def test_a_correction_leaves_the_errors_before_in_what_it_conserves():
     np.testing.assert_allclose(
         residual @ residual, left @ left / (seen @ covariance @ seen), rtol=1e-12
     )
-    assert "as if they were not corrected" not in " ".join(ji.fit(problem, starts=1).warnings)
+    assert "as if they were not corrected" not in " ".join(
+        ji.fit(problem, starts=1).warnings
+    )
     own = ji.Experiments(pre, post, **errors, lost_freedom=1)
     warnings = " ".join(ji.fit(ji.Newton(e), scene, own, starts=1).warnings)
     assert "The fit weighs shots 1, 2 as if they were not corrected" in warnings
@@ -43,12 +51,16 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
     m1, m2, before = 1.0, 2.0, np.array([0.05, 0.02])
 
     def jacobian(e):
-        return np.array([[m1 - e * m2, (1 + e) * m2], [(1 + e) * m1, m2 - e * m1]]) / (m1 + m2)
+        return np.array([[m1 - e * m2, (1 + e) * m2], [(1 + e) * m1, m2 - e * m1]]) / (
+            m1 + m2
+        )
 
     def at_true_velocities(e):
         """The inverse of C, the residual, and the slope of v+ in e at the true v-."""
         spread = np.diag(before**2)
-        inverse = np.linalg.inv(0.02**2 * np.eye(2) + jacobian(e) @ spread @ jacobian(e).T)
+        inverse = np.linalg.inv(
+            0.02**2 * np.eye(2) + jacobian(e) @ spread @ jacobian(e).T
+        )
         left = pre @ jacobian(e).T - post
         true = pre - left @ inverse @ jacobian(e) @ spread
         return inverse, left, true @ (jacobian(1.0) - jacobian(0.0)).T
@@ -66,7 +78,9 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
     np.testing.assert_allclose(
         found.standard_error / max(found.noise, 1), information**-0.5, rtol=1e-4
     )
-    assert "those of the velocities before, whose true values are searched for" in str(found)
+    assert "those of the velocities before, whose true values are searched for" in str(
+        found
+    )
     (many,) = ji.fit_many(ji.Newton(0.1), ji.chain([m1, m2]), [data])
     np.testing.assert_allclose(many.value, found.value, rtol=1e-6)
     np.testing.assert_allclose(many.standard_error, found.standard_error, rtol=1e-4)
@@ -75,7 +89,11 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
     np.testing.assert_allclose(spread, found.standard_error[0], rtol=0.1)
 
     robust = ji.fit(
-        ji.Newton(0.1), ji.chain([m1, m2]), data, starts=1, search=ji.Search(loss="student")
+        ji.Newton(0.1),
+        ji.chain([m1, m2]),
+        data,
+        starts=1,
+        search=ji.Search(loss="student"),
     )
     inverse, left, slope = at_true_velocities(robust.value[0])
     covariance = np.linalg.inv(inverse)
@@ -96,7 +114,10 @@ def test_shots_with_different_numbers_of_contacts_are_fitted_together():
     ]
     pre = np.array([[1.0, 0.0, -0.3], [1.0, 0.2, 0.1], [1.0, 0.2, 0.3]])
     true = np.array([0.8, 0.6, 0.5])
-    post = [ji.impact(ji.Newton(true[: s.contacts]), s, v).velocity for s, v in zip(scenes, pre)]
+    post = [
+        ji.impact(ji.Newton(true[: s.contacts]), s, v).velocity
+        for s, v in zip(scenes, pre)
+    ]
     data = ji.Experiments(pre, np.array(post), scenes=scenes)
     found = ji.fit(ji.Newton([0.7, 0.7, 0.7]), None, data, starts=1)
     np.testing.assert_allclose(found.value, true, atol=1e-9)
@@ -111,13 +132,22 @@ def test_shots_with_different_numbers_of_contacts_are_fitted_together():
 @pytest.mark.slow
 def test_padding_with_friction():
     """A cube's corner and its edge in one fit: contacts that are not there change nothing."""
-    corner = ji.Scene([1.0, 1.0, 0.5], [[0.0], [1.0], [0.4]], tangents=[[1.0], [0.0], [0.3]])
+    corner = ji.Scene(
+        [1.0, 1.0, 0.5], [[0.0], [1.0], [0.4]], tangents=[[1.0], [0.0], [0.3]]
+    )
     both = np.array([[0.0, 0.0], [1.0, 1.0], [0.4, -0.3]])
-    edge = ji.Scene([1.0, 1.0, 0.5], both, tangents=[[1.0, 1.0], [0.0, 0.0], [0.3, 0.3]])
+    edge = ji.Scene(
+        [1.0, 1.0, 0.5], both, tangents=[[1.0, 1.0], [0.0, 0.0], [0.3, 0.3]]
+    )
     pre = np.array([[0.5, -1.0, 0.1], [0.3, -1.0, 0.0]])
-    post = [ji.impact(ji.Moreau(0.4, 0.2), s, v).velocity for s, v in zip((corner, edge), pre)]
+    post = [
+        ji.impact(ji.Moreau(0.4, 0.2), s, v).velocity
+        for s, v in zip((corner, edge), pre)
+    ]
     data = ji.Experiments(pre, np.array(post), scenes=[corner, edge])
-    found = ji.fit(ji.Moreau(0.6, 0.3), None, data, ("restitution", "friction"), starts=1)
+    found = ji.fit(
+        ji.Moreau(0.6, 0.3), None, data, ("restitution", "friction"), starts=1
+    )
     np.testing.assert_allclose(found.value, [0.4, 0.2], atol=1e-8)
 
 
@@ -125,4 +155,6 @@ def test_scenes_that_cannot_be_fitted_together():
     tangents = [[0.0], [1.0]]
     one = ji.Scene([1.0, 1.0], [[1.0], [0.0]], tangents=tangents)
     with pytest.raises(ValueError, match="equally many tangents a contact"):
-        ji.Experiments(np.ones((2, 2)), np.ones((2, 2)), scenes=[one, ji.chain([1.0, 1.0])])
+        ji.Experiments(
+            np.ones((2, 2)), np.ones((2, 2)), scenes=[one, ji.chain([1.0, 1.0])]
+        )

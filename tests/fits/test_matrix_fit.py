@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from matrix_fit_cases import CHAIN, E_TRUE, OUTSIDE, PROBLEM, PUSHED, START, fitted, shots
+from matrix_fit_cases import (
+    CHAIN,
+    E_TRUE,
+    OUTSIDE,
+    PROBLEM,
+    PUSHED,
+    START,
+    fitted,
+    shots,
+)
 
 import jimpact as ji
 from jimpact import RestitutionMatrix, fit, read_study
@@ -26,7 +35,9 @@ def test_one_shot_is_always_reproduced():
         np.testing.assert_allclose(found.residual, 0, atol=1e-8)
         assert found.rank == 2
         assert "rms residual   0 (the values are reproduced)" in str(found)
-        assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
+        assert any(
+            "Nothing keeps this matrix consistent" in line for line in found.warnings
+        )
 
 
 @pytest.mark.slow
@@ -42,7 +53,9 @@ def test_a_study_of_a_matrix_needs_no_more_than_its_data(tmp_path):
     (tmp_path / "shots.csv").write_text(
         "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.25,0.75\n2,0,0.5,1.5\n"
     )
-    text = '[scene]\nmasses_kg = [1, 1]\n[law]\nname = "%s"\n[data]\nfile = "shots.csv"\n'
+    text = (
+        '[scene]\nmasses_kg = [1, 1]\n[law]\nname = "%s"\n[data]\nfile = "shots.csv"\n'
+    )
     for name, other in (
         ("restitution_matrix", None),
         ('newton"\nrestitution = 0.7 #', "restitution_matrix"),
@@ -62,7 +75,9 @@ def test_too_few_shots_say_which_entries_are_undetermined():
     assert found.rank == 2
     for name in ("matrix[1,2]", "matrix[2,2]"):
         assert any(f"cannot see {name}:" in line for line in found.identifiability)
-    np.testing.assert_allclose(np.asarray(found.law.matrix)[:, 0], E_TRUE[:, 0], atol=1e-8)
+    np.testing.assert_allclose(
+        np.asarray(found.law.matrix)[:, 0], E_TRUE[:, 0], atol=1e-8
+    )
     assert np.isinf(found.standard_error[[1, 3]]).all()
     # of exact data
     assert np.isnan(found.standard_error[[0, 2]]).all()
@@ -101,7 +116,9 @@ def test_descent_with_projected_gradients_ends_at_the_best_matrix():
         inward = (x - jax.vmap(PROBLEM.project)(x - rate * gradients)) / rate
         with jax.numpy_dtype_promotion("standard"):  # which optax needs
             update, state = adam.update(jnp.stack([gradients[0], inward[1]]), state)
-        moved = jnp.stack([x[0] + update[0], x[1] + update[1], x[2] - rate * gradients[2]])
+        moved = jnp.stack(
+            [x[0] + update[0], x[1] + update[1], x[2] - rate * gradients[2]]
+        )
         return (jax.vmap(PROBLEM.project)(moved), state), None
 
     start = jnp.asarray(np.tile(OUTSIDE, (3, 1)))
@@ -139,11 +156,18 @@ def test_scenes_without_an_admissible_set():
         fit(RestitutionMatrix(START), redundant, data, {"matrix": True})
     eight = ji.Experiments([[1.0, 0, 0, 0, 0, 0, 0, 0]], [[0.0, 0, 0, 0, 0, 0, 0, 1.0]])
     with pytest.raises(ValueError, match="at most 6 contacts"):
-        fit(RestitutionMatrix(0.1 * np.eye(7)), ji.chain(jnp.ones(8)), eight, {"matrix": True})
+        fit(
+            RestitutionMatrix(0.1 * np.eye(7)),
+            ji.chain(jnp.ones(8)),
+            eight,
+            {"matrix": True},
+        )
 
 
 def test_held_entries_that_leave_no_room():
     """Elastic first column: any entry more in the second would gain energy somewhere."""
     elastic = np.eye(2)
     with pytest.raises(ValueError, match="must leave an admissible choice"):
-        fitted(shots(E_TRUE), start=elastic, free=np.array([[False, True], [False, False]]))
+        fitted(
+            shots(E_TRUE), start=elastic, free=np.array([[False, True], [False, False]])
+        )

@@ -32,7 +32,9 @@ def slacks(e, g_inverse):
     [
         CHAIN,
         ji.chain([1.0, 5.0, 0.1], wall=True, gaps=[0.0, 0.1, 0.0]),
-        ji.Scene([1.0, 1.0], [[1.0, 0.5], [0.0, 1.0]]),  # contacts that push the same way
+        ji.Scene(
+            [1.0, 1.0], [[1.0, 0.5], [0.0, 1.0]]
+        ),  # contacts that push the same way
         ji.Scene([1.0, 1.0], [[1.0, 0.9], [0.0, 0.3]]),
     ],
 )
@@ -58,7 +60,9 @@ def test_the_admissible_least_squares_solution_is_found():
         return (after(jnp.asarray(e).reshape(2, 2), pre) - post).reshape(-1)
 
     offset = np.asarray(residual(np.zeros(4)))
-    slope = np.stack([np.asarray(residual(unit)) - offset for unit in np.eye(4)], axis=1)
+    slope = np.stack(
+        [np.asarray(residual(unit)) - offset for unit in np.eye(4)], axis=1
+    )
 
     def conditions(e):  # copositive 2 x 2: closed form
         q = g_inverse - e.reshape(2, 2).T @ g_inverse @ e.reshape(2, 2)
@@ -76,7 +80,9 @@ def test_the_admissible_least_squares_solution_is_found():
     free = np.linalg.lstsq(slope, -offset, rcond=None)[0]
     assert min(conditions(free)) < -0.01  # the conditions matter
     np.testing.assert_allclose(found.law.matrix.ravel(), oracle.x, atol=3e-6)
-    np.testing.assert_allclose(np.sum(np.asarray(found.residual) ** 2), oracle.fun, rtol=1e-8)
+    np.testing.assert_allclose(
+        np.sum(np.asarray(found.residual) ** 2), oracle.fun, rtol=1e-8
+    )
 
 
 @pytest.mark.release

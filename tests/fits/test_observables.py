@@ -28,7 +28,9 @@ file = "heights.csv"
 @pytest.mark.release
 def test_a_study_of_a_motion_is_fitted(tmp_path):
     ball = ji.System(ji.Column([1.0]), gravity=True)
-    q = np.asarray(ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q)[:, 0]
+    q = np.asarray(ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q)[
+        :, 0
+    ]
     lines = [f"{100 * i},{100 * x:.8f}" for i, x in enumerate(q)]
     (tmp_path / "heights.csv").write_text("t[ms],q_1[cm]\n" + "\n".join(lines) + "\n")
     (tmp_path / "study.toml").write_text(MOTION)
@@ -43,7 +45,10 @@ def test_motions_that_cannot_be_read(tmp_path):
     for text, message in (
         ("t[s],q_1[m]\n0,1\n1,1\n3,1\n", "must rise in equal steps"),
         ("t[s],q_2[m]\n0,1\n1,1\n", "the columns must be `q_1`, `q_2` and `t`"),
-        ("t[s],v_1[m/s]\n0,1\n1,1\n", r"column 2 must be one of `t\[s\]`, `q_1\[unit\]`"),
+        (
+            "t[s],v_1[m/s]\n0,1\n1,1\n",
+            r"column 2 must be one of `t\[s\]`, `q_1\[unit\]`",
+        ),
         ("t[s],q_1[m],sigma_q_1[m]\n0,1,1\n1,1,0\n", "must be > 0, but is 0"),
         ("t[s],q_1[m]\n", "the file has no samples"),
     ):

@@ -19,7 +19,9 @@ from jimpact import read_study
 @pytest.fixture(scope="module")
 def found():
     return ji.fit(
-        ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01)
+        ji.Newton(0.5),
+        PAIR,
+        ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01),
     )
 
 
@@ -33,7 +35,9 @@ def lenient():
 @pytest.fixture(scope="module")
 def every():
     data = ji.Experiments(PRE, after(np.full(12, 0.8), 0.01), sigma=0.01)
-    return ji.fit_laws(PAIR, data, ["moreau", "newton", "restitution_matrix"], speed=True)
+    return ji.fit_laws(
+        PAIR, data, ["moreau", "newton", "restitution_matrix"], speed=True
+    )
 
 
 @pytest.mark.slow
@@ -46,7 +50,9 @@ def test_laws_that_agree_are_listed_by_what_they_must_know(every):
     assert newton.aicc == pytest.approx(newton.fit.starts[0].sum_of_squares + 2)
     assert every.left_out == {"restitution_matrix": "needs `matrix`"}
     assert not every.speed.needed
-    assert every.verdict.startswith("The simplest law that fits is newton: restitution = 0.8")
+    assert every.verdict.startswith(
+        "The simplest law that fits is newton: restitution = 0.8"
+    )
     assert "predict" not in str(every)
     reported = json.loads(json.dumps(every.to_dict(), allow_nan=False))
     assert reported["best"] == "newton"
@@ -67,7 +73,9 @@ def test_the_criterion_without_sigma_is_corrected_for_few_values():
 def test_a_law_that_fails_is_named_and_comes_last():
     """Newton pulls at a contact that separates."""
     balls = ji.chain([1.0, 1.0, 1.0])
-    data = ji.Experiments([[1.0, 0.0, 1.0], [2.0, 0.0, 1.5]], [[0.1, 0.9, 1.0], [0.2, 1.8, 1.9]])
+    data = ji.Experiments(
+        [[1.0, 0.0, 1.0], [2.0, 0.0, 1.5]], [[0.1, 0.9, 1.0], [0.2, 1.8, 1.9]]
+    )
     reported = []
     found = ji.fit_laws(
         balls,
@@ -133,7 +141,9 @@ def test_restitution_by_a_table_and_by_a_function_of_the_speed():
     speeds, values = [0.5, 1.0, 4.0], [0.9, 0.8, 0.5]
     table = ji.VelocityDependent(ji.Newton(0.9), curve=(speeds, values))
     v = np.array([0.1, 0.75, 2.5, 9.0])
-    np.testing.assert_allclose(table.restitution_at(v), 0.9 * np.interp(v, speeds, values))
+    np.testing.assert_allclose(
+        table.restitution_at(v), 0.9 * np.interp(v, speeds, values)
+    )
     above = ji.VelocityDependent(ji.Newton(0.9), curve=lambda v: 2.0 / (1.0 + v))
     np.testing.assert_allclose(above.restitution_at(v), np.minimum(1.8 / (1 + v), 1.0))
     slope = jax.grad(lambda v: table.restitution_at(v))(2.0)
@@ -179,7 +189,9 @@ def test_every_law_takes_the_option(base):
     law = ji.VelocityDependent(base(0.5), speed_exponent=0.25, yield_speed=0.1)
     out = ji.impact(law, PAIR, [3.0, 0.5])
     e = law.restitution_at(2.5)
-    np.testing.assert_allclose(out.velocity, ji.impact(base(e), PAIR, [3.0, 0.5]).velocity)
+    np.testing.assert_allclose(
+        out.velocity, ji.impact(base(e), PAIR, [3.0, 0.5]).velocity
+    )
     slow = ji.impact(law, PAIR, [0.05, 0.0])
     assert abs(float(slow.energy_change)) < 1e-15
 
@@ -198,17 +210,35 @@ def test_a_study_names_the_option(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ji.VelocityDependent(ji.RestitutionMatrix(np.eye(2))), "`law` must have `rest"),
+        (
+            lambda: ji.VelocityDependent(ji.RestitutionMatrix(np.eye(2))),
+            "`law` must have `rest",
+        ),
         (lambda: ji.VelocityDependent(ji.VelocityDependent(ji.Newton(0.5))), "already"),
-        (lambda: ji.VelocityDependent(ji.Newton(0.5), speed_exponent=3.0), r"lie in \[-1, 1\]"),
-        (lambda: ji.VelocityDependent(ji.Newton(0.5), yield_speed=-1.0), "`yield_speed`"),
-        (lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([1, 2], [0.5])), "`curve`.*two or"),
+        (
+            lambda: ji.VelocityDependent(ji.Newton(0.5), speed_exponent=3.0),
+            r"lie in \[-1, 1\]",
+        ),
+        (
+            lambda: ji.VelocityDependent(ji.Newton(0.5), yield_speed=-1.0),
+            "`yield_speed`",
+        ),
+        (
+            lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([1, 2], [0.5])),
+            "`curve`.*two or",
+        ),
         (
             lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([2, 1], [0.5, 0.5])),
             "speeds that rise",
         ),
-        (lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([1, 2], [0.5, -1])), "`curve`.*-1"),
-        (lambda: ji.VelocityDependent(ji.Newton(0.5), curve=lambda v: 1.0), "`curve`.*shape"),
+        (
+            lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([1, 2], [0.5, -1])),
+            "`curve`.*-1",
+        ),
+        (
+            lambda: ji.VelocityDependent(ji.Newton(0.5), curve=lambda v: 1.0),
+            "`curve`.*shape",
+        ),
         (
             lambda: ji.VelocityDependent(
                 ji.Newton(0.5), speed_exponent=0.1, curve=([1, 2], [0.5, 0.4])
@@ -216,7 +246,9 @@ def test_a_study_names_the_option(tmp_path):
             "must not both",
         ),
         (
-            lambda: ji.REGISTRY["velocity_dependent"].build(base="magic", restitution=0.9),
+            lambda: ji.REGISTRY["velocity_dependent"].build(
+                base="magic", restitution=0.9
+            ),
             "`base` must be one of",
         ),
         (
@@ -263,11 +295,15 @@ def test_exponents_are_sought_where_they_mean_something():
     assert problem.domains.tolist() == [[1.0, 5.0], [1.0, 7.0]]
 
 
-def test_a_posterior_by_an_arviz_that_is_too_new_is_refused_before_it_is_drawn(monkeypatch):
+def test_a_posterior_by_an_arviz_that_is_too_new_is_refused_before_it_is_drawn(
+    monkeypatch,
+):
     """Version 1 has no `InferenceData`: the message says so at once."""
     monkeypatch.setitem(sys.modules, "numpyro", SimpleNamespace())
     monkeypatch.setitem(sys.modules, "arviz", SimpleNamespace(__version__="1.3.0"))
-    with pytest.raises(ImportError, match=r"arviz must be older than 1 .* is 1\.3\.0: pip install"):
+    with pytest.raises(
+        ImportError, match=r"arviz must be older than 1 .* is 1\.3\.0: pip install"
+    ):
         ji.posterior(None)
 
 

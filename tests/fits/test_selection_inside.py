@@ -17,7 +17,9 @@ from jimpact.laws.velocity_dependent import approach_speed
 @pytest.fixture(scope="module")
 def found():
     return ji.fit(
-        ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01)
+        ji.Newton(0.5),
+        PAIR,
+        ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01),
     )
 
 
@@ -56,7 +58,9 @@ def test_lzb_and_compliant_take_the_option():
         law = ji.VelocityDependent(base, speed_exponent=0.25, yield_speed=0.01)
         e = law.restitution_at(jnp.full(2, 2.0))
         expected = ji.impact(with_parameter(base, "restitution", e), balls, v).velocity
-        np.testing.assert_allclose(ji.impact(law, balls, v).velocity, expected, atol=1e-9)
+        np.testing.assert_allclose(
+            ji.impact(law, balls, v).velocity, expected, atol=1e-9
+        )
         slow = ji.impact(law, balls, [0.01, 0.0, 0.0])
         assert abs(float(slow.energy_change)) < 1e-10
 
@@ -66,11 +70,18 @@ def test_lzb_and_compliant_take_the_option():
 def test_priors_are_declared_like_domains(found):
     kinds = pytest.importorskip("numpyro.distributions")
     problem = found.problem
-    for given, low, high in (({}, 0.0, 1.0), ({"restitution": ji.Uniform(0.2, 0.4)}, 0.2, 0.4)):
+    for given, low, high in (
+        ({}, 0.0, 1.0),
+        ({"restitution": ji.Uniform(0.2, 0.4)}, 0.2, 0.4),
+    ):
         prior = _priors(problem, given, kinds)["restitution"]
         assert (float(prior.low), float(prior.high)) == pytest.approx((low, high))
-    normal = _priors(problem, {"restitution": ji.Normal(0.9, 0.1)}, kinds)["restitution"]
-    inside = 0.5 * (1 + erf(1 / np.sqrt(2)))  # truncated at 1, one standard deviation above
+    normal = _priors(problem, {"restitution": ji.Normal(0.9, 0.1)}, kinds)[
+        "restitution"
+    ]
+    inside = 0.5 * (
+        1 + erf(1 / np.sqrt(2))
+    )  # truncated at 1, one standard deviation above
     top = np.exp(float(normal.log_prob(0.9)))
     assert top == pytest.approx(1 / (0.1 * np.sqrt(2 * np.pi) * inside), rel=1e-6)
     beta = kinds.Beta(2.0, 2.0)
@@ -78,10 +89,14 @@ def test_priors_are_declared_like_domains(found):
     data = ji.Experiments([1.0, 0.0], [-0.2, 0.6], 0.01)
     given = {"restitution": (0.8, 0.05)}
     known = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, data, priors=given)
-    own = _priors(known, {}, kinds)["restitution"]  # of the fit, unless others are given
+    own = _priors(known, {}, kinds)[
+        "restitution"
+    ]  # of the fit, unless others are given
     assert float(own.log_prob(0.8) - own.log_prob(0.85)) == pytest.approx(0.5)
     assert (
-        type(_priors(known, {"restitution": ji.Uniform(0.2, 0.4)}, kinds)["restitution"])
+        type(
+            _priors(known, {"restitution": ji.Uniform(0.2, 0.4)}, kinds)["restitution"]
+        )
         is kinds.Uniform
     )
     lzb = ji.FitProblem.from_shots(

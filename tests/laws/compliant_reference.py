@@ -69,7 +69,9 @@ def elastic_plastic(mass, normals, velocity, k, eta, e, gaps, tol=1e-12, phases=
             return np.where(working, k * np.maximum(x, 0) ** eta, 0.0)
 
         def rates(y, slow=slow, force=force):
-            return np.concatenate([-slow * (normals.T @ y[m:]), inverse @ (normals @ force(y[:m]))])
+            return np.concatenate(
+                [-slow * (normals.T @ y[m:]), inverse @ (normals @ force(y[:m]))]
+            )
 
         events, what = [], []
         for j in range(m):
@@ -91,7 +93,10 @@ def elastic_plastic(mass, normals, velocity, k, eta, e, gaps, tol=1e-12, phases=
         for (j, kind), now in zip(what, rang):
             if not now:
                 continue
-            loading[j], unloading[j] = kind in ("close", "reload"), kind == "turn" and x[j] > 1e-13
+            loading[j], unloading[j] = (
+                kind in ("close", "reload"),
+                kind == "turn" and x[j] > 1e-13,
+            )
             if kind in ("open", "close") or (kind == "turn" and not unloading[j]):
                 x[j] = 0.0
     raise RuntimeError("too many phases")
@@ -128,7 +133,9 @@ def viscous(mass, normals, velocity, force, gaps, tol=1e-12, phases=500, onset=N
                 events.append(
                     (
                         lambda y, j=j: (
-                            max(sign(y, j), -(1.0 if y[j] > 0 else 0.0)) if y[j] > ROUNDING else 1.0
+                            max(sign(y, j), -(1.0 if y[j] > 0 else 0.0))
+                            if y[j] > ROUNDING
+                            else 1.0
                         ),
                         -1,
                     )
@@ -138,9 +145,16 @@ def viscous(mass, normals, velocity, force, gaps, tol=1e-12, phases=500, onset=N
             else:
                 gap = x[j] < 0
                 events.append(
-                    (lambda y, j=j, gap=gap: y[j] - ROUNDING if y[j] < 0 or gap else 1.0, 1)
+                    (
+                        lambda y, j=j, gap=gap: (
+                            y[j] - ROUNDING if y[j] < 0 or gap else 1.0
+                        ),
+                        1,
+                    )
                 )
-                events.append((lambda y, j=j: sign(y, j) if y[j] > ROUNDING else -1.0, 1))
+                events.append(
+                    (lambda y, j=j: sign(y, j) if y[j] > ROUNDING else -1.0, 1)
+                )
                 what += [(j, True), (j, True)]
         y, rang = _run(rates, np.concatenate([x, v]), events, tol)
         x, v = y[:m], y[m:]

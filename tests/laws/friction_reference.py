@@ -16,7 +16,11 @@ def blocks(scene, v):
     """W_nn, W_nt, W_tt, gap velocities, slip velocities."""
     mass = np.asarray(scene.mass)
     inverse = np.diag(1 / mass) if mass.ndim == 1 else np.linalg.inv(mass)
-    n, h, v = np.asarray(scene.normals), np.asarray(scene.tangents), np.asarray(v, float)
+    n, h, v = (
+        np.asarray(scene.normals),
+        np.asarray(scene.tangents),
+        np.asarray(v, float),
+    )
     return n.T @ inverse @ n, n.T @ inverse @ h, h.T @ inverse @ h, n.T @ v, h.T @ v
 
 
@@ -76,7 +80,9 @@ def small_steps(scene, v, stiffness, exponent, e, mu, steps=3000):
             for j, i in enumerate(at):
                 tried = side[i] - relax[j] * (slip[i] + along[i] @ side)
                 length = np.linalg.norm(tried)
-                side[i] = tried if length <= mu[j] * p[j] else tried * (mu[j] * p[j] / length)
+                side[i] = (
+                    tried if length <= mu[j] * p[j] else tried * (mu[j] * p[j] / length)
+                )
             if np.abs(side - before).max() <= 1e-14 * np.abs(side).max():
                 break
         after = pushed + inverse @ h @ side
@@ -100,14 +106,23 @@ class Regularized:
     The state is (v, x); phases are frozen between events, so that the field is smooth there.
     """
 
-    def __init__(self, scene, stiffness, exponent, e, mu, eps, method="Radau", rtol=RTOL):
+    def __init__(
+        self, scene, stiffness, exponent, e, mu, eps, method="Radau", rtol=RTOL
+    ):
         mass = np.asarray(scene.mass, float)
         self.inverse = np.linalg.inv(np.diag(mass) if mass.ndim == 1 else mass)
         self.n, self.h = np.asarray(scene.normals), np.asarray(scene.tangents)
         m = self.m = self.n.shape[1]
         given = (stiffness, exponent, e, mu)
-        self.k, self.eta, self.e, self.mu = (np.broadcast_to(x, (m,)).astype(float) for x in given)
-        self.eps, self.method, self.rtol, self.phase = eps, method, rtol, np.full(m, OPEN)
+        self.k, self.eta, self.e, self.mu = (
+            np.broadcast_to(x, (m,)).astype(float) for x in given
+        )
+        self.eps, self.method, self.rtol, self.phase = (
+            eps,
+            method,
+            rtol,
+            np.full(m, OPEN),
+        )
 
     def rates(self, _, state):
         """(v', x')."""
@@ -117,7 +132,9 @@ class Regularized:
         size = np.sqrt((u**2).sum(axis=1) + self.eps**2)
         side = -(self.mu * force / size)[:, None] * u
         pushed = self.inverse @ (self.n @ force + self.h @ side.ravel())
-        slope = np.select([self.phase == CLOSES, self.phase == OPENS], [1.0, self.e**-2.0], 0.0)
+        slope = np.select(
+            [self.phase == CLOSES, self.phase == OPENS], [1.0, self.e**-2.0], 0.0
+        )
         return np.concatenate([pushed, -slope * (self.n.T @ v)])
 
     def events(self):
@@ -128,7 +145,10 @@ class Regularized:
             def turns(_, state, j=j):
                 return self.n[:, j] @ state[: -self.m]
 
-            turns.terminal, turns.direction = True, 1.0 if self.phase[j] == CLOSES else -1.0
+            turns.terminal, turns.direction = (
+                True,
+                1.0 if self.phase[j] == CLOSES else -1.0,
+            )
             found.append(turns)
             if self.phase[j] == OPENS:
 
@@ -156,11 +176,15 @@ class Regularized:
         v = np.asarray(v, float)
         gamma, w = self.n.T @ v, np.einsum("nj,nk,kj->j", self.n, self.inverse, self.n)
         self.speed = np.abs(gamma).max()
-        strokes = ((self.eta + 1) * self.speed**2 / (2 * w * self.k)) ** (1 / (self.eta + 1))
+        strokes = ((self.eta + 1) * self.speed**2 / (2 * w * self.k)) ** (
+            1 / (self.eta + 1)
+        )
         self.stroke, time = strokes.max(), LONGEST * strokes.max() / self.speed
         state = np.concatenate([v, np.zeros(self.m)])
         self.phase = np.where(gamma < 0, CLOSES, OPEN)
-        atol = self.rtol * np.append(np.full(len(v), self.speed), np.full(self.m, self.stroke))
+        atol = self.rtol * np.append(
+            np.full(len(v), self.speed), np.full(self.m, self.stroke)
+        )
         for _ in range(1000):
             if (self.phase == OPEN).all():
                 return state[: -self.m]
@@ -184,7 +208,9 @@ def regularized(scene, v, stiffness, exponent, e, mu, eps=1e-6, method="Radau"):
     """
     speed = np.abs(np.asarray(scene.normals).T @ np.asarray(v, float)).max()
     runs = [
-        Regularized(scene, stiffness, exponent, e, mu, part * eps * speed, method).after(v)
+        Regularized(
+            scene, stiffness, exponent, e, mu, part * eps * speed, method
+        ).after(v)
         for part in (1.0, 2.0)
     ]
     limit = 2 * runs[0] - runs[1]

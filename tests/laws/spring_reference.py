@@ -7,7 +7,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 OPEN, COMPRESSED, EXPANDS = 0, 1, 2
-START = 1e-9  # [s] the first moment of contacts that slide from x = 0, where the force is 0
+START = (
+    1e-9  # [s] the first moment of contacts that slide from x = 0, where the force is 0
+)
 
 
 class Springs:
@@ -81,7 +83,10 @@ class Springs:
             gamma, u, _, _ = self.of(y)
             xi = self.split(y)[2][j]
             along = xi @ u[j] / np.linalg.norm(xi)
-            return along - self.mu[j] / (self.kappa[j] * self.eta[j]) * self.sinks(gamma)[j]
+            return (
+                along
+                - self.mu[j] / (self.kappa[j] * self.eta[j]) * self.sinks(gamma)[j]
+            )
 
         def room(t, y, j):
             return self.of(y)[3][j] - np.linalg.norm(self.split(y)[2][j])
@@ -117,7 +122,9 @@ class Springs:
         for j in np.flatnonzero(self.phase == COMPRESSED):
             y = self.touched(y, j)
         for _ in range(most):
-            if np.all(self.phase == OPEN) and np.all(self.normals.T @ self.split(y)[0] > -1e-12):
+            if np.all(self.phase == OPEN) and np.all(
+                self.normals.T @ self.split(y)[0] > -1e-12
+            ):
                 return self.split(y)[0]
             found = list(self.margins())
             events = [f for _, _, f in found]

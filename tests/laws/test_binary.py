@@ -30,14 +30,18 @@ def three_balls(masses, e, v):
     """Outcomes and numbers of collisions of a batch, always compiled for the same shape."""
     count = len(masses)
     e = np.broadcast_to(np.reshape(e, (count, -1)), (count, 2))
-    padded = [np.resize(np.asarray(x, float), (LANES, np.shape(x)[1])) for x in (masses, e, v)]
+    padded = [
+        np.resize(np.asarray(x, float), (LANES, np.shape(x)[1])) for x in (masses, e, v)
+    ]
     return jax.tree.map(lambda x: np.asarray(x)[:count], program()(*padded))
 
 
 def test_number_of_collisions_is_that_of_the_chebyshev_solution():
     rng = np.random.default_rng(0)
     masses, e = 10.0 ** rng.uniform(-1, 1, (LANES, 3)), rng.uniform(0.02, 1, LANES)
-    c = np.sqrt(1 / (1 + masses[:, 1] / masses[:, 0]) / (1 + masses[:, 1] / masses[:, 2]))
+    c = np.sqrt(
+        1 / (1 + masses[:, 1] / masses[:, 0]) / (1 + masses[:, 1] / masses[:, 2])
+    )
     z = (1 + e) / (2 * np.sqrt(e)) * c
     ratio = np.pi / np.arccos(np.minimum(z, 1 - 1e-9))
     clear = np.abs(ratio - np.round(ratio)) > 1e-6
@@ -129,7 +133,9 @@ def test_sequence():
     v = -np.sort(rng.normal(size=5))
     scene = ji.chain(masses, gaps=gaps)
     steps = ji.Binary(e, "earliest").sequence(scene, v)
-    expected, done = plain(np.asarray(scene.normals), np.diag(masses), gaps, v, e, "earliest")
+    expected, done = plain(
+        np.asarray(scene.normals), np.diag(masses), gaps, v, e, "earliest"
+    )
     assert [step[0] for step in steps] == done
     assert len(done) > 2
     times = [step[1] for step in steps]
@@ -147,11 +153,15 @@ def test_ball_and_ground_in_both_orders():
     """(6.3) and (6.4); ball 1 on top, +x up in the formulas: -v for `chain`."""
     scene, v = ji.chain([2.0, 5.0], wall=True), [1.0, 0.5]
     out = ji.impact(ji.Binary([0.8, 0.7], (1, 0), max_collisions=2), scene, v)
-    np.testing.assert_allclose(-out.velocity, [103 / 140, -241 / 700], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        -out.velocity, [103 / 140, -241 / 700], rtol=0, atol=1e-14
+    )
     assert names(out.status) == ["max_steps"]
     law = ji.Binary([0.8, 0.7], (0, 1))
     out = ji.impact(law, scene, v)
-    np.testing.assert_allclose(-out.velocity, [3839 / 4900, 1807 / 24500], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        -out.velocity, [3839 / 4900, 1807 / 24500], rtol=0, atol=1e-14
+    )
     assert names(out.status) == ["ok"]
     assert int(law.collisions(scene, v)) == 3
 
@@ -174,9 +184,13 @@ def test_endless_collisions_are_recognized_inside_their_cone_only():
     e[:150, 0], e[80:220, 1] = 0.0, 0.0
     v = np.stack([np.ones(LANES), np.zeros(LANES), rng.uniform(-0.2, 2, LANES)], axis=1)
     out, count = three_balls(masses, e, v)
-    c = np.sqrt(1 / (1 + masses[:, 1] / masses[:, 0]) / (1 + masses[:, 1] / masses[:, 2]))
+    c = np.sqrt(
+        1 / (1 + masses[:, 1] / masses[:, 0]) / (1 + masses[:, 1] / masses[:, 2])
+    )
     z = c * np.sqrt((1 + e).prod(axis=1)) / np.maximum(np.sqrt(e).sum(axis=1), 1e-300)
-    root = np.sqrt([1 / masses[:, 0] + 1 / masses[:, 1], 1 / masses[:, 1] + 1 / masses[:, 2]]).T
+    root = np.sqrt(
+        [1 / masses[:, 0] + 1 / masses[:, 1], 1 / masses[:, 1] + 1 / masses[:, 2]]
+    ).T
     gamma = np.diff(v, axis=1)
     one = (gamma < 0).sum(axis=1) == 1
     expected = [endless_by_recursion(*row) for row in zip(c, e, gamma / root)]
@@ -186,7 +200,9 @@ def test_endless_collisions_are_recognized_inside_their_cone_only():
     assert inside.sum() > 120
     assert outside.sum() > 60  # z >= 1 is not enough
     common = (masses * v).sum(axis=1) / masses.sum(axis=1)
-    np.testing.assert_allclose(out.velocity[inside], np.tile(common[inside, None], 3), atol=1e-13)
+    np.testing.assert_allclose(
+        out.velocity[inside], np.tile(common[inside, None], 3), atol=1e-13
+    )
 
 
 def test_kink_where_a_collision_appears():
@@ -237,7 +253,9 @@ def test_a_chain_is_never_made_dense():
     masses = jnp.ones(137)
     for order in ORDERS[:3]:
         law = ji.Binary(0.9, order)
-        trace = jax.make_jaxpr(lambda v, law=law: ji.impact(law, ji.chain(masses), v))(masses)
+        trace = jax.make_jaxpr(lambda v, law=law: ji.impact(law, ji.chain(masses), v))(
+            masses
+        )
         assert "136]" in str(trace)
         assert "136,136" not in str(trace)
 
@@ -247,7 +265,9 @@ def test_second_derivatives_in_every_pair_of_modes():
     """All are of one program: they agree to rounding of the largest entry."""
 
     def after(e):
-        return ji.impact(ji.Binary(e), ji.chain([1.0, 2.0, 0.7]), [1.0, 0.0, -0.4]).velocity[2]
+        return ji.impact(
+            ji.Binary(e), ji.chain([1.0, 2.0, 0.7]), [1.0, 0.0, -0.4]
+        ).velocity[2]
 
     e, modes = jnp.array([0.9, 0.6]), (jax.jacfwd, jax.jacrev)
     found = [outer(inner(after))(e) for outer in modes for inner in modes]

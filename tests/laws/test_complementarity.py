@@ -55,7 +55,9 @@ def spread(count, coordinates, seed):
 def test_moreau_and_poisson_against_every_support():
     states = spread(100, 4, seed=5)
     states = [s for s in states if (problem(s)[1] < 0).any()]
-    (moreau, _), (poisson, _) = (programs.values(name)(states) for name in ("moreau", "poisson"))
+    (moreau, _), (poisson, _) = (
+        programs.values(name)(states) for name in ("moreau", "poisson")
+    )
     for i, state in enumerate(states):
         w, gamma = problem(state)
         root = np.sqrt(np.diag(w))
@@ -64,17 +66,27 @@ def test_moreau_and_poisson_against_every_support():
         got = moreau.impulse[i]
         np.testing.assert_allclose((w @ got) / root, (w @ p) / root, atol=size)
         p_c, gamma_c = enumerate_supports(w, gamma)
-        p = p_c * (1 + state.e) + enumerate_supports(w, gamma_c + w @ (state.e * p_c))[0]
-        np.testing.assert_allclose((w @ poisson.impulse[i]) / root, (w @ p) / root, atol=size)
+        p = (
+            p_c * (1 + state.e)
+            + enumerate_supports(w, gamma_c + w @ (state.e * p_c))[0]
+        )
+        np.testing.assert_allclose(
+            (w @ poisson.impulse[i]) / root, (w @ p) / root, atol=size
+        )
 
 
 def test_plastic_moreau_is_nonnegative_least_squares():
     rng = np.random.default_rng(1)
-    states = [State(np.eye(4), rng.normal(size=(4, 3)), rng.normal(size=4), e=0) for _ in range(30)]
+    states = [
+        State(np.eye(4), rng.normal(size=(4, 3)), rng.normal(size=4), e=0)
+        for _ in range(30)
+    ]
     out, _ = programs.values("moreau")(states)
     for state, p in zip(states, out.impulse):
         if (state.normals.T @ state.velocity < 0).any():
-            np.testing.assert_allclose(p, nnls(state.normals, -state.velocity)[0], atol=1e-11)
+            np.testing.assert_allclose(
+                p, nnls(state.normals, -state.velocity)[0], atol=1e-11
+            )
 
 
 def integer_states(count, seed=2):
@@ -109,7 +121,9 @@ def test_singular_and_degenerate_problems():
             assert p.min() >= 0
             assert rate.min() > -1e-11
             assert np.abs(p * rate).max() < 1e-11
-            unique = np.linalg.matrix_rank(w[np.ix_(p > 1e-9, p > 1e-9)]) == (p > 1e-9).sum()
+            unique = (
+                np.linalg.matrix_rank(w[np.ix_(p > 1e-9, p > 1e-9)]) == (p > 1e-9).sum()
+            )
             assert unique or reported[i] != "ok"
     assert min(seen.values()) > 10, seen
 
@@ -125,12 +139,17 @@ def test_least_norm_of_many():
     def impulse(normals, v):
         scene = ji.Scene(jnp.eye(3), normals)
         outs = [
-            ji.impact(law, scene, v) for law in (ji.Newton(0.5), ji.Moreau(0.5), ji.Poisson(0.5))
+            ji.impact(law, scene, v)
+            for law in (ji.Newton(0.5), ji.Moreau(0.5), ji.Poisson(0.5))
         ]
-        return jnp.stack([out.impulse for out in outs]), jnp.stack([out.status for out in outs])
+        return jnp.stack([out.impulse for out in outs]), jnp.stack(
+            [out.status for out in outs]
+        )
 
     v = np.array([[-1.0, 0, 0], [-1.0, -0.05, 0.0]])
-    p, status = impulse(np.stack([legs, legs, legs[:, order]]), np.stack([v[0], v[1], v[1]]))
+    p, status = impulse(
+        np.stack([legs, legs, legs[:, order]]), np.stack([v[0], v[1], v[1]])
+    )
     np.testing.assert_allclose(p[0], 0.375, atol=1e-13)
     assert set(names(status)) == {"impulse_not_unique"}
     np.testing.assert_allclose(np.asarray(p[2]), np.asarray(p[1])[:, order], atol=1e-13)
@@ -159,11 +178,13 @@ def test_derivatives_at_a_kink_are_one_sided():
     """Contact 2 takes part while v3 < 1/2: p2 = max(0, (1 - 2 v3) / 3)."""
 
     def p2(v3):
-        return ji.impact(ji.Moreau(0.0), ji.chain(jnp.ones(3)), jnp.stack([1.0, 0.0, v3])).impulse[
-            1
-        ]
+        return ji.impact(
+            ji.Moreau(0.0), ji.chain(jnp.ones(3)), jnp.stack([1.0, 0.0, v3])
+        ).impulse[1]
 
-    low, at, high = jax.jit(jax.vmap(jax.grad(p2)))(jnp.array([0.5 - 1e-9, 0.5, 0.5 + 1e-9]))
+    low, at, high = jax.jit(jax.vmap(jax.grad(p2)))(
+        jnp.array([0.5 - 1e-9, 0.5, 0.5 + 1e-9])
+    )
     assert float(low) == pytest.approx(-2 / 3)
     assert float(high) == 0.0
     assert min(abs(float(at) - side) for side in (-2 / 3, 0.0)) < 1e-12

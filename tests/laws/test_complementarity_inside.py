@@ -32,11 +32,17 @@ def test_ties_within_rounding(monkeypatch, rounding):
     rng, count, m, r = np.random.default_rng(12), 20_000, 6, 3
     normals = rng.integers(-2, 3, (count, m, r)) * rng.uniform(0.3, 3, (count, m, 1))
     root = rng.normal(size=(count, r, r))
-    w = normals @ (root @ root.transpose(0, 2, 1) + 0.1 * np.eye(r)) @ normals.transpose(0, 2, 1)
+    w = (
+        normals
+        @ (root @ root.transpose(0, 2, 1) + 0.1 * np.eye(r))
+        @ normals.transpose(0, 2, 1)
+    )
     v, e = rng.integers(-2, 3, (count, r)), rng.integers(0, 3, (count, m)) / 2
     q = (1 + e) * np.einsum("kmr,kr->km", normals, v)
     there = np.flatnonzero((normals != 0).any(axis=2).all(axis=1))
-    solve = jax.jit(jax.vmap(lambda matrix, right: solve_lcp(matrix, right)))  # compiled anew
+    solve = jax.jit(
+        jax.vmap(lambda matrix, right: solve_lcp(matrix, right))
+    )  # compiled anew
     z, rate, code = map(np.asarray, solve(w[there], q[there]))
     solved = code <= programs.CODE["impulse_not_unique"]
     root = np.sqrt(np.diagonal(w[there], axis1=1, axis2=2))

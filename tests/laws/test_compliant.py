@@ -71,7 +71,13 @@ def test_forces_without_losses(eta, force):
     k = [1.0, 2.5, 0.7]
     given = [
         chain([1.0, 1.0, 1.0, 1.0], [1, 0, 0, 0], e=1.0, k=k, eta=eta),
-        chain([1.0, 2.0, 1.5, 0.7], [1.0, 0.4, 0.1, -0.6], k=k, eta=eta, gaps=[0.0, 0.3, 0.0]),
+        chain(
+            [1.0, 2.0, 1.5, 0.7],
+            [1.0, 0.4, 0.1, -0.6],
+            k=k,
+            eta=eta,
+            gaps=[0.0, 0.3, 0.0],
+        ),
     ]
 
     @jax.jit
@@ -94,16 +100,42 @@ def test_lzb_against_an_oracle_of_another_formulation():
     rows = [
         # masses, wall, k, e, eta, v, stored
         ([3, 1, 2], False, [1, 3], [0.95, 0.4], [1.5, 1.5], [1, 0, -0.5], 0.0),
-        ([1, 4, 0.5, 2], False, [0.05, 20, 1], [0.3, 0.9, 1], [1.3] * 3, [1, 0.2, 0, 0], 0.0),
+        (
+            [1, 4, 0.5, 2],
+            False,
+            [0.05, 20, 1],
+            [0.3, 0.9, 1],
+            [1.3] * 3,
+            [1, 0.2, 0, 0],
+            0.0,
+        ),
         ([1, 1, 1], "left", [1, 2, 0.7], [0.8, 0.9, 0.6], [2] * 3, [-1, -1, -1], 0.0),
-        ([1, 2, 1], True, [4, 2, 0.7], [0.8, 0.9, 0.6], [1, 1.5, 2], [1, 0.5, 0.2], 0.0),
+        (
+            [1, 2, 1],
+            True,
+            [4, 2, 0.7],
+            [0.8, 0.9, 0.6],
+            [1, 1.5, 2],
+            [1, 0.5, 0.2],
+            0.0,
+        ),
         ([1, 2, 1], False, [1, 2], [0.9, 0.7], [1.5, 1.5], [1, 0, 0.2], [0.3, 0.05]),
     ]
     states = []
     for masses, wall, k, e, eta, v, stored in rows:
         after, p, *_ = lzb_oracle(*chain_matrices(masses, wall), v, k, e, eta, stored)
         states.append(
-            chain(masses, v, wall, k=k, e=e, eta=eta, stored=stored, after=after, impulse=p)
+            chain(
+                masses,
+                v,
+                wall,
+                k=k,
+                e=e,
+                eta=eta,
+                stored=stored,
+                after=after,
+                impulse=p,
+            )
         )
     programs.check_held("lzb", states, allowed=2e-7)
 
@@ -132,7 +164,9 @@ def damped(name):
     """(k, damping, masses, v, gaps) -> outcome of three balls and its slope along all of them."""
 
     def velocity(k, c, mass, v, gaps):
-        return ji.impact(ji.Compliant(FORCES[name][0](k, c)), ji.chain(mass, gaps=gaps), v)
+        return ji.impact(
+            ji.Compliant(FORCES[name][0](k, c)), ji.chain(mass, gaps=gaps), v
+        )
 
     return jax.jit(jax.vmap(velocity))
 
@@ -141,14 +175,20 @@ def draw(number=COUNT, seed=1):
     rng = np.random.default_rng(seed)
     mass = 10 ** rng.uniform(-0.7, 0.7, (number, 3))
     v = np.sort(rng.normal(size=(number, 3)))[:, ::-1].copy()
-    k, c = 10 ** rng.uniform(-1, 1, (number, 2)), 10 ** rng.uniform(-2, 0.5, (number, 2))
+    k, c = (
+        10 ** rng.uniform(-1, 1, (number, 2)),
+        10 ** rng.uniform(-2, 0.5, (number, 2)),
+    )
     closed = rng.uniform(size=(number, 2)) < 0.3
     return k, c, mass, v, np.where(closed, 0, 10 ** rng.uniform(-2, 1, (number, 2)))
 
 
 @pytest.mark.parametrize(
     "force",
-    [pytest.param(x, marks=[pytest.mark.release] if x != "kelvin-voigt" else []) for x in FORCES],
+    [
+        pytest.param(x, marks=[pytest.mark.release] if x != "kelvin-voigt" else [])
+        for x in FORCES
+    ],
 )
 def test_damped_chains_against_scipy(force):
     """Forces that slacken at x > 0 and are loaded again, at any damping; none of it elastic."""
@@ -164,7 +204,9 @@ def test_damped_chains_against_scipy(force):
             gaps[i],
             onset=onset and onset(k[i], c[i]),
         )
-        np.testing.assert_allclose(out.velocity[i], expected, atol=1e-6 * np.abs(v[i]).max())
+        np.testing.assert_allclose(
+            out.velocity[i], expected, atol=1e-6 * np.abs(v[i]).max()
+        )
     assert (np.asarray(out.status) == 0).all()
     assert (np.asarray(out.energy_change)[:-1] <= 0).all()
     assert abs(float(out.energy_change[-1])) < 1e-7
@@ -174,7 +216,9 @@ def test_damped_chains_against_scipy(force):
 @pytest.mark.parametrize(
     "force",
     [
-        pytest.param(x, marks=pytest.mark.slow if x == "hunt-crossley" else pytest.mark.release)
+        pytest.param(
+            x, marks=pytest.mark.slow if x == "hunt-crossley" else pytest.mark.release
+        )
         for x in FORCES
     ],
 )
@@ -189,7 +233,9 @@ def test_damped_derivatives(force):
 
     at = (k, c, gaps, v)
     rng = np.random.default_rng(0)
-    along = jax.tree.map(lambda z: jnp.asarray(rng.normal(size=z.shape)) * jnp.abs(z), at)
+    along = jax.tree.map(
+        lambda z: jnp.asarray(rng.normal(size=z.shape)) * jnp.abs(z), at
+    )
     f = jax.jit(lambda s: velocity(jax.tree.map(lambda z, d: z + s * d, at, along)))
     rate = jax.jit(lambda d: jax.jvp(velocity, (at,), (d,))[1])(along)
     h = 1e-4
@@ -205,7 +251,9 @@ def test_restitution_of_a_damped_spring():
     k, m = 2.0, 0.7
     near = 1 + np.array([-2e-4, -9e-5, 9e-5, 2e-4])
     zeta = np.concatenate([[0.01, 0.3, 0.65, 0.8], near, [1.2, 3.0, 1.0]])
-    closed = ji.measured_restitution(ji.KelvinVoigt(k, 2 * zeta * np.sqrt(k * m)), m, 1.0)
+    closed = ji.measured_restitution(
+        ji.KelvinVoigt(k, 2 * zeta * np.sqrt(k * m)), m, 1.0
+    )
     for e, z in zip(closed[:-1], zeta):
         # x is a sum of exp(r t sqrt(k / m)), and x'' = 0 where the force ends
         r = np.roots([1.0, 2 * z, 1.0]).astype(complex)
@@ -221,7 +269,9 @@ def test_derivatives_of_restitution_about_critical_damping(zeta):
     """First to third, beside Cauchy's integrals of the formula around a circle."""
 
     def restitution(damping):
-        return ji.measured_restitution(ji.KelvinVoigt(0.5, damping), 2.0, 1.0)  # zeta = damping / 2
+        return ji.measured_restitution(
+            ji.KelvinVoigt(0.5, damping), 2.0, 1.0
+        )  # zeta = damping / 2
 
     turn = np.exp(2j * np.pi * (np.arange(64) + 0.5) / 64)
     z = zeta + 0.25 * turn
@@ -237,8 +287,12 @@ def test_derivatives_of_restitution_about_critical_damping(zeta):
 def test_restitution_of_a_pair():
     """`measured_restitution` is what an impact gives; Hunt and Crossley's implicit relation."""
     e, speed = 0.5, 2.5
-    a = brentq(lambda a: a * (1 + e) - np.log1p(a) + np.log1p(-a * e), 1e-3, (1 - 1e-13) / e)
-    got = ji.measured_restitution(ji.HuntCrossley(3.0, a / speed), jnp.array([0.2, 4.0]), speed)
+    a = brentq(
+        lambda a: a * (1 + e) - np.log1p(a) + np.log1p(-a * e), 1e-3, (1 - 1e-13) / e
+    )
+    got = ji.measured_restitution(
+        ji.HuntCrossley(3.0, a / speed), jnp.array([0.2, 4.0]), speed
+    )
     np.testing.assert_allclose(got, e, atol=1e-9)
     found = ji.calibrate(ji.HuntCrossley(3.0, 0.0), e, 0.2, speed)
     assert float(found.damping) == pytest.approx(a / speed, rel=1e-7)
@@ -290,9 +344,15 @@ def test_calibration_is_differentiable():
 
     at, h = jnp.array([0.7, 1.3, 0.8]), 1e-4
     forward, reverse, values = jax.jit(
-        lambda x, moved: (jax.jacfwd(damping)(x), jax.jacrev(damping)(x), jax.vmap(damping)(moved))
+        lambda x, moved: (
+            jax.jacfwd(damping)(x),
+            jax.jacrev(damping)(x),
+            jax.vmap(damping)(moved),
+        )
     )(at, at[None] + h * jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
-    np.testing.assert_allclose(forward, (values[:3] - values[3:]) / (2 * h), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(
+        forward, (values[:3] - values[3:]) / (2 * h), rtol=1e-5, atol=1e-7
+    )
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
 
 
@@ -300,14 +360,21 @@ def test_calibration_is_differentiable():
 def test_user_forces():
     """One's own force is the built-in one; without a value it is reported; it cannot pull."""
     gaps = jnp.array([0.0, 0.2])
-    user = ji.UserForce(lambda x, rate, p: p["k"] * x + p["c"] * rate, {"k": 1.0, "c": 0.3})
+    user = ji.UserForce(
+        lambda x, rate, p: p["k"] * x + p["c"] * rate, {"k": 1.0, "c": 0.3}
+    )
     outcomes = [
         ji.impact(ji.Compliant(force), ji.chain(jnp.ones(3), gaps=gaps), STRIKE)
         for force in (user, ji.KelvinVoigt(1.0, 0.3))
     ]
     np.testing.assert_allclose(outcomes[0].velocity, outcomes[1].velocity, atol=1e-8)
-    for function in (lambda x, rate, _: x * jnp.nan, lambda x, rate, _: jnp.sqrt(0.1 - x)):
-        out = ji.impact(ji.Compliant(ji.UserForce(function)), ji.chain([1.0, 1.0]), [1.0, 0.0])
+    for function in (
+        lambda x, rate, _: x * jnp.nan,
+        lambda x, rate, _: jnp.sqrt(0.1 - x),
+    ):
+        out = ji.impact(
+            ji.Compliant(ji.UserForce(function)), ji.chain([1.0, 1.0]), [1.0, 0.0]
+        )
         assert names(out.status) == ["not_finite"]
     sticky = ji.UserForce(lambda x, rate, _: x - 0.05)
     out = ji.impact(ji.Compliant(sticky), ji.chain([1.0, 1.0]), [1.0, 0.0])
@@ -322,9 +389,13 @@ def test_a_force_that_is_cut_at_0_keeps_the_tolerance():
     masses, v = [4.0, 0.03, 0.6], np.array([11.0, 0.0, -0.7])
     force = FORCES["hunt-crossley"]
     after = jax.jit(
-        lambda d: ji.impact(ji.Compliant(force[0](k, d)), ji.chain(masses, gaps=gaps), v)
+        lambda d: ji.impact(
+            ji.Compliant(force[0](k, d)), ji.chain(masses, gaps=gaps), v
+        )
     )(d)
-    expected = viscous(*chain_matrices(masses), v, force[1](k, d), gaps, onset=force[2](k, d))
+    expected = viscous(
+        *chain_matrices(masses), v, force[1](k, d), gaps, onset=force[2](k, d)
+    )
     np.testing.assert_allclose(after.velocity, expected, atol=1.5e-8 * 11)
 
 
@@ -349,7 +420,12 @@ def test_forces_that_are_positive_at_touch():
 
     c = 0.9
     wall, chain = run(jnp.array([0.0, 2.0, 25.0, 6.0]), jnp.array([0.0, 0.0, 0.0, c]))
-    u = brentq(lambda u: np.log((1 + 0.8 * c) / (1 - u * c)) - c * (0.8 + u), 0.1, 0.8, xtol=1e-14)
+    u = brentq(
+        lambda u: np.log((1 + 0.8 * c) / (1 - u * c)) - c * (0.8 + u),
+        0.1,
+        0.8,
+        xtol=1e-14,
+    )
     np.testing.assert_allclose(wall.velocity[:, 0], [0.8, 0.8, 0.8, u], atol=1e-8)
     np.testing.assert_allclose(chain.energy_change[:3], 0.0, atol=1e-8)
     assert float(chain.energy_change[3]) < -0.01
@@ -373,7 +449,9 @@ def test_many_balls_strike_many():
 @pytest.mark.slow
 def test_history_of_one_ball_on_a_linear_spring():
     """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
-    history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
+    history = ji.history(
+        ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]
+    )
     w, t = np.sqrt(2.0), np.asarray(history.time)
     x = np.sin(w * t) / w
     np.testing.assert_allclose(t[-1], np.pi / w, rtol=1e-7)
@@ -449,7 +527,9 @@ def test_histories():
         kinetic = 0.5 * h.velocity[i] ** 2 @ columns[0][i]
         total = kinetic + h.energy[i].sum(axis=1)
         assert np.diff(total).max() < 1e-7
-        np.testing.assert_allclose(total[0], 0.5 * columns[1][i] ** 2 @ columns[0][i], rtol=1e-12)
+        np.testing.assert_allclose(
+            total[0], 0.5 * columns[1][i] ** 2 @ columns[0][i], rtol=1e-12
+        )
         assert (h.force[i] >= 0).all()
         assert (h.maximum_force[i] >= h.force[i].max(axis=0) - 1e-9).all()
     for i, newton in ((3, 51.66), (4, 52.90), (5, 52.90)):

@@ -40,7 +40,11 @@ def faster(law):
 
     def of(states):
         rows = [
-            (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.e, s.k, s.stored)))
+            (
+                np.diag(s.mass),
+                s.velocity,
+                *(np.broadcast_to(x, 3) for x in (s.e, s.k, s.stored)),
+            )
             for s in states
         ]
         return jax.tree.map(np.asarray, run(*(np.array(x, float) for x in zip(*rows))))
@@ -121,11 +125,17 @@ def test_directions_at_one_point():
     given, way = jnp.array([0.9, 0.7, 1.0, 2.5]), jnp.array([0.3, -1.0, 0.5, 2.0])
 
     def after(x):
-        return ji.impact(ji.LZB(x[:2], x[2:]), ji.chain(jnp.ones(3)), jnp.eye(3)[0]).velocity
+        return ji.impact(
+            ji.LZB(x[:2], x[2:]), ji.chain(jnp.ones(3)), jnp.eye(3)[0]
+        ).velocity
 
     @jax.jit
     def all_ways(x):
-        return jax.jacfwd(after)(x), jax.jacrev(after)(x), jax.jvp(after, (x,), (way,))[1]
+        return (
+            jax.jacfwd(after)(x),
+            jax.jacrev(after)(x),
+            jax.jvp(after, (x,), (way,))[1],
+        )
 
     forward, reverse, alone = all_ways(given)
     np.testing.assert_allclose(forward @ way, alone, atol=1e-12)
@@ -153,7 +163,9 @@ def test_windows_of_long_chains():
 
 
 def test_a_chain_is_never_made_dense():
-    trace = jax.make_jaxpr(lambda v: ji.impact(ji.LZB(0.9), ji.chain(jnp.ones(137)), v).velocity)
+    trace = jax.make_jaxpr(
+        lambda v: ji.impact(ji.LZB(0.9), ji.chain(jnp.ones(137)), v).velocity
+    )
     text = str(trace(jnp.ones(137)))
     assert "136" in text
     assert "136,136" not in text

@@ -22,15 +22,21 @@ close = np.testing.assert_allclose
 
 # (e, mu, e_t, k) -> law; e_t is of the kinematic laws, k of LZB
 LAWS = {
-    "newton": lambda e, mu, e_t, k: ji.Newton(e, friction=mu, tangential_restitution=e_t),
-    "moreau": lambda e, mu, e_t, k: ji.Moreau(e, friction=mu, tangential_restitution=e_t),
+    "newton": lambda e, mu, e_t, k: ji.Newton(
+        e, friction=mu, tangential_restitution=e_t
+    ),
+    "moreau": lambda e, mu, e_t, k: ji.Moreau(
+        e, friction=mu, tangential_restitution=e_t
+    ),
     "matrix": lambda e, mu, e_t, k: ji.RestitutionMatrix(
         jnp.diag(e), friction=mu, tangential_restitution=e_t
     ),
     "binary": lambda e, mu, e_t, k: ji.Binary(
         e, "earliest", friction=mu, tangential_restitution=e_t
     ),
-    "poisson": lambda e, mu, e_t, k: ji.Poisson(e, friction=mu, tangential_restitution=e_t),
+    "poisson": lambda e, mu, e_t, k: ji.Poisson(
+        e, friction=mu, tangential_restitution=e_t
+    ),
     "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu, method="time"),
     "compliant": lambda e, mu, e_t, k: ji.Compliant(
         ji.Bistiffness(k, 1.5, e), friction=mu, method="time"
@@ -66,10 +72,14 @@ def run(name, mass, normals, tangents, v, e, mu, e_t=0.0, k=1.0):
     full = np.tile(np.eye(n + idle), (count, 1, 1))
     full[:, :n, :n] = mass
     mass = full
-    normals, tangents = (np.pad(x, ((0, 0), (0, idle), (0, 0))) for x in (normals, tangents))
+    normals, tangents = (
+        np.pad(x, ((0, 0), (0, idle), (0, 0))) for x in (normals, tangents)
+    )
     v = np.pad(v, ((0, 0), (0, idle)))
     if m == 1:
-        normals, tangents = (np.concatenate([x, x[:, :, :rows]], 2) for x in (normals, tangents))
+        normals, tangents = (
+            np.concatenate([x, x[:, :, :rows]], 2) for x in (normals, tangents)
+        )
     # far from closing while the other one is indented: `compliant` would feel it
     gaps = np.tile([0.0, 1e3 * (m == 1)], (count, 1))
     per = [
@@ -98,12 +108,17 @@ DISC = (
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=[] if x == "moreau" else [pytest.mark.release]) for x in LAWS],
+    [
+        pytest.param(x, marks=[] if x == "moreau" else [pytest.mark.release])
+        for x in LAWS
+    ],
 )
 def test_disc_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
     e_ts = (-0.3, 0.0, 1.0) if name in KINEMATIC or name == "poisson" else (0.0,)
-    grid = np.array(list(itertools.product((0.0, 0.1, 0.4, 50.0), e_ts, (-2.0, 0.3), (0.0, 1.5))))
+    grid = np.array(
+        list(itertools.product((0.0, 0.1, 0.4, 50.0), e_ts, (-2.0, 0.3), (0.0, 1.5)))
+    )
     mu, e_t, x_rate, turn = grid.T
     e, y_rate, count = 0.6, -1.3, len(grid)
     v = np.stack([x_rate, np.full(count, y_rate), turn], axis=1)
@@ -116,7 +131,9 @@ def test_disc_in_closed_form(name):
     if name == "poisson":  # in compression it sticks at rest, in expansion at -e_t v_t-
         most = mu * MASS * 1.3
         first = np.clip(-slip / w, -most, most)
-        side = first + np.clip(-(slip + w * first + e_t * slip) / w, -e * most, e * most)
+        side = first + np.clip(
+            -(slip + w * first + e_t * slip) / w, -e * most, e * most
+        )
     off = 1e-8 if name in ("lzb", "compliant") else 1e-13
     assert not out.status.any()
     close(out.impulse[:, 0], p, rtol=off)
@@ -140,7 +157,11 @@ def test_binary_is_newton_at_one_contact_after_another(v):
         dict(friction=0.2, tangential_restitution=0.1),
     )
     out = ji.impact(ji.Binary(e, **rubs), block, v)
-    normals, tangents, after = np.asarray(block.normals), np.asarray(block.tangents), np.array(v)
+    normals, tangents, after = (
+        np.asarray(block.normals),
+        np.asarray(block.tangents),
+        np.array(v),
+    )
     for _ in range(20):
         rate = normals.T @ after
         j = int(np.argmin(rate))
@@ -220,8 +241,15 @@ def test_a_single_contact_in_closed_form():
         return impulses(mu, e), jnp.stack(jax.jacfwd(impulses, argnums=(0, 1))(mu, e))
 
     v = [(0.5, -1, 0), (-0.3, -1, 0.2), (2, -1, 1)]
-    rows = [(v, mu, e, 0.0) for v in v for mu in (0.0, 0.1, 0.8, 5.0) for e in (0.0, 0.5, 0.9)]
-    loaded = [((u, 0.1, 0.0), mu, 0.7, 0.4) for u in (1.0, -1.0) for mu in (0.1, 1.0, 5.0)]
+    rows = [
+        (v, mu, e, 0.0)
+        for v in v
+        for mu in (0.0, 0.1, 0.8, 5.0)
+        for e in (0.0, 0.5, 0.9)
+    ]
+    loaded = [
+        ((u, 0.1, 0.0), mu, 0.7, 0.4) for u in (1.0, -1.0) for mu in (0.1, 1.0, 5.0)
+    ]
     found, slopes = impulses_with_slopes(*map(np.array, zip(*rows, *loaded)))
     scene, h = ji.Scene(mass, normals, tangents=tangents), 1e-6
     for (v, mu, e, _), p, slope in zip(rows, found, slopes):
@@ -229,7 +257,11 @@ def test_a_single_contact_in_closed_form():
         expected = np.array(routh(scene, v, mu, e))
         close(p, expected, atol=1e-8)
         for dmu, de, one in ((h, 0, slope[0]), (0, h, slope[1])):
-            close(one, (np.array(routh(scene, v, mu + dmu, e + de)) - expected) / h, atol=1e-4)
+            close(
+                one,
+                (np.array(routh(scene, v, mu + dmu, e + de)) - expected) / h,
+                atol=1e-4,
+            )
     *expected, least = np.array([by_small_impulses(scene, *row) for row in loaded]).T
     close(found[-len(loaded) :], np.transpose(expected), atol=3e-4)
     assert (least < 0).any()  # drawn back by friction, and compressed
@@ -316,9 +348,13 @@ def test_block_lying_flat(name):
     out, _ = run(name, *of_scene(FLAT, 3), np.tile(v, (3, 1)), np.full(3, e), mu, e_t)
     slip = np.asarray(FLAT.tangents).T @ v
     gamma = np.asarray(FLAT.normals).T @ v
-    close(out.velocity @ np.asarray(FLAT.normals), -e * np.array([gamma] * 3), atol=1e-13)
+    close(
+        out.velocity @ np.asarray(FLAT.normals), -e * np.array([gamma] * 3), atol=1e-13
+    )
     close(out.velocity[0, 0], v[0], atol=1e-14)  # without friction
-    close(np.asarray(FLAT.tangents).T @ out.velocity[1], -0.2 * slip, atol=1e-13)  # it sticks
+    close(
+        np.asarray(FLAT.tangents).T @ out.velocity[1], -0.2 * slip, atol=1e-13
+    )  # it sticks
     share = out.tangential_impulse[1] / out.impulse[1]  # in proportion to mu p
     close(share[0], share[1], rtol=1e-10)
     close(out.tangential_impulse[2], -0.2 * out.impulse[2], atol=1e-13)  # it slides
@@ -328,7 +364,10 @@ def test_block_lying_flat(name):
 def random_scenes(count, rows=1, n=3, seed=5, most=0.0, coupling=1.0):
     rng = np.random.default_rng(seed)
     a = coupling * rng.normal(size=(count, n, n))
-    normals, tangents = rng.normal(size=(count, n, 2)), rng.normal(size=(count, n, 2 * rows))
+    normals, tangents = (
+        rng.normal(size=(count, n, 2)),
+        rng.normal(size=(count, n, 2 * rows)),
+    )
     v = rng.normal(size=(count, n))
     v[(np.einsum("cni,cn->ci", normals, v) >= 0).all(axis=1)] *= -1
     e, k = rng.uniform(0.3, 1, (count, 2)), 10 ** rng.uniform(-1, 1, (count, 2))
@@ -379,7 +418,9 @@ def test_outcomes_satisfy_the_kinematic_law(name, rows):
         for i in range(64):  # `infeasible` exactly where no pattern is consistent
             mass, normals, tangents, v = (x[i] for x in scenes)
             both = np.concatenate([normals, tangents], axis=1)
-            given = np.concatenate([(1 + e[i]) * (normals.T @ v), (1 + e_t) * (tangents.T @ v)])
+            given = np.concatenate(
+                [(1 + e[i]) * (normals.T @ v), (1 + e_t) * (tangents.T @ v)]
+            )
             several = solutions(both.T @ np.linalg.solve(mass, both), given, mu[i])
             assert (several == 0) == (names(out.status[i]) == ["infeasible"])
             if several > 1:
@@ -402,7 +443,9 @@ def solutions(w, given, mu):
             p[i] <= room
             if slip is None
             else p[i] >= -room
-            and (slip * rate[i] >= -room if slip else abs(side[i]) <= mu[i] * p[i] + room)
+            and (
+                slip * rate[i] >= -room if slip else abs(side[i]) <= mu[i] * p[i] + room
+            )
             for i, slip in enumerate(pattern)
         ):
             found.add(tuple(np.round(w @ x, 7)))
@@ -422,7 +465,9 @@ def test_none_and_several_outcomes_are_reported():
         [1.0, 0.0, 1.0],
     )
     normals, tangents, v = (np.array(x) for x in zip(none, several))
-    out, _ = run("newton", np.ones((2, 3)), normals, tangents, v, 0.5 * np.ones(2), np.ones(2))
+    out, _ = run(
+        "newton", np.ones((2, 3)), normals, tangents, v, 0.5 * np.ones(2), np.ones(2)
+    )
     assert names(out.status) == ["infeasible", "several_outcomes"]
     close(normals[1].T @ out.velocity[1], [1.5, 1.0], atol=1e-12)
     # a particle between two walls with unequal e cannot leave one as the other would have it
@@ -452,11 +497,15 @@ def check_random(rows, most_failed):
     *given, stiff = (np.concatenate(x) for x in zip(*lanes))
     out, found = run("lzb", *given, k=stiff)
     out, turned, faster = (
-        jax.tree.map(lambda x, i=i: x[i : i + count], out) for i in (0, count, 2 * count)
+        jax.tree.map(lambda x, i=i: x[i : i + count], out)
+        for i in (0, count, 2 * count)
     )
     good = ~failed(out.status)
     assert (~good).mean() <= most_failed
-    p, side = out.impulse, np.linalg.norm(out.tangential_impulse.reshape(count, 2, rows), axis=2)
+    p, side = (
+        out.impulse,
+        np.linalg.norm(out.tangential_impulse.reshape(count, 2, rows), axis=2),
+    )
     assert found.consistent[:count][good].all()
     assert (p >= 0)[good].all()
     assert (side <= mu * p + 1e-6)[good].all()
@@ -499,7 +548,9 @@ def test_contacts_that_stick_together_share_friction_in_proportion_to_mu_f():
     """lambda_j / (mu_j F_j) are equal where tangents are, whatever the arms of the normals."""
     tangents = [[1, 1], [0, 0], [0.1, 0.1]]
     uneven = ji.Scene([1.0, 1.0, 0.1], [[0, 0], [1, 1], [-0.5, 0.6]], tangents=tangents)
-    course = ji.history(ji.LZB(0.5, friction=[0.4, 0.3]), uneven, [0.0, -1.0, 0.0], samples=5)
+    course = ji.history(
+        ji.LZB(0.5, friction=[0.4, 0.3]), uneven, [0.0, -1.0, 0.0], samples=5
+    )
     used = np.array(course.tangential_force / course.force)[1:-1] / [0.4, 0.3]
     assert (np.abs(used) > 0.01).all()
     assert (np.abs(used) < 1).all()
@@ -510,7 +561,14 @@ def test_contacts_that_stick_together_share_friction_in_proportion_to_mu_f():
 def test_a_flat_block_at_a_fine_tolerance():
     """How the corners share what they hold is known to 1e-8 only: no step need be short for it."""
     e, mu = np.array([0.71, 0.58, 0.98, 0.47]), np.array([0.81, 0.83, 0.71, 0.42])
-    v = np.array([[0.10, -0.54, 0.36], [0.41, -1.04, -0.13], [-0.31, -1.46, 1.96], [-0.2, -1, 0.9]])
+    v = np.array(
+        [
+            [0.10, -0.54, 0.36],
+            [0.41, -1.04, -0.13],
+            [-0.31, -1.46, 1.96],
+            [-0.2, -1, 0.9],
+        ]
+    )
     block = ji.Block(1.0, 2.0, corners="base").scene()
 
     def fine(e, mu, v):
@@ -539,7 +597,9 @@ def test_lzb_in_space():
     both = np.zeros((6, 2))
     both[[0, 3], 0] = both[[1, 4], 1] = 1.0
     mu, p = np.array([0.1, 5.0]), 1.8
-    twice = (np.stack([x, x]) for x in (ball, up, both, [0.6, 0.8, -1, 0.18, 0.24, 0.5]))
+    twice = (
+        np.stack([x, x]) for x in (ball, up, both, [0.6, 0.8, -1, 0.18, 0.24, 0.5])
+    )
     space, _ = run("lzb", *twice, np.full(2, 0.8), mu)
     side = -np.minimum(mu * p, 1.3 / 3.5)
     close(space.velocity[:, :2] @ [0.6, 0.8], 1 + side, atol=1e-7)
@@ -553,9 +613,9 @@ def test_lzb_without_friction():
     """mu = 0 is the frictionless law; no tangents are needed without `friction`."""
     (mass, normals, tangents, v), e, _, k = random_scenes(16, seed=8)
     none, _ = run("lzb", mass, normals, tangents, v, e, np.zeros((16, 2)), k=k)
-    bare = jax.jit(jax.vmap(lambda m, n, v, e, k: ji.impact(ji.LZB(e, k, 1.5), ji.Scene(m, n), v)))(
-        mass, normals, v, e, k
-    )
+    bare = jax.jit(
+        jax.vmap(lambda m, n, v, e, k: ji.impact(ji.LZB(e, k, 1.5), ji.Scene(m, n), v))
+    )(mass, normals, v, e, k)
     good = ~failed(bare.status) & ~failed(none.status)
     assert good.sum() >= 15
     close(none.velocity[good], np.asarray(bare.velocity)[good], atol=1e-7)
@@ -604,20 +664,30 @@ def test_derivatives(name, kind):
     lanes = [np.concatenate([y + s * step * d for s in shifts]) for y, d in zip(x, way)]
     given = (np.concatenate([y] * 5) for y in (*way, *scenes[:3]))
     ways = tuple(next(given) for _ in way)
-    v, status, rate, back = map(np.asarray, jax.jit(jax.vmap(along))(tuple(lanes), ways, *given))
+    v, status, rate, back = map(
+        np.asarray, jax.jit(jax.vmap(along))(tuple(lanes), ways, *given)
+    )
     f, fine = v.reshape(5, 8, n), ~failed(status).reshape(5, 8).any(axis=0)
-    slope, rate, back = (f[1] - 8 * f[2] + 8 * f[3] - f[4]) / (12 * step), rate[:8], back[:8]
+    slope, rate, back = (
+        (f[1] - 8 * f[2] + 8 * f[3] - f[4]) / (12 * step),
+        rate[:8],
+        back[:8],
+    )
     assert fine.sum() >= (3 if name == "newton" else 6)
     close(back[fine], (rate @ weight)[fine], atol=1e-9)
     error = np.abs(rate - slope)[fine].max(axis=1)
-    assert np.sort(error)[-2] < 2e-5, error  # one of them may cross a change of stick and slip
+    assert np.sort(error)[-2] < 2e-5, (
+        error
+    )  # one of them may cross a change of stick and slip
 
 
 @pytest.mark.slow
 def test_slopes_of_a_plastic_poisson():
     """At e = 0 towards the only side there is: what expands slides as it did."""
     particle = ji.Scene([1.0, 1.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
-    after = jax.jacfwd(lambda e: ji.impact(ji.Poisson(e, 0.1), particle, [1.0, -1.0]).velocity)
+    after = jax.jacfwd(
+        lambda e: ji.impact(ji.Poisson(e, 0.1), particle, [1.0, -1.0]).velocity
+    )
     close(jax.jit(after)(0.0), [-0.1, 1.0], atol=1e-12)
 
 
@@ -634,7 +704,9 @@ def test_frictionless_scenes_pay_nothing():
     bare = ji.Scene(block.mass, block.normals, gaps=block.gaps)
 
     def operations(scene, **given):
-        program = jax.make_jaxpr(lambda v: ji.impact(ji.LZB(0.8, **given), scene, v).velocity)
+        program = jax.make_jaxpr(
+            lambda v: ji.impact(ji.LZB(0.8, **given), scene, v).velocity
+        )
         return count(program(np.array([1.0, -1.0, 0.0])).jaxpr)
 
     plain = operations(bare)
@@ -643,16 +715,24 @@ def test_frictionless_scenes_pay_nothing():
 
 BAD = {
     "mu": (lambda: ji.Newton(0.5, friction=-0.1), "`friction`.*-0.1"),
-    "mu of a contact": (lambda: ji.Moreau(0.5, friction=[0.1, -0.2]), "`friction`.*index 1"),
+    "mu of a contact": (
+        lambda: ji.Moreau(0.5, friction=[0.1, -0.2]),
+        "`friction`.*index 1",
+    ),
     "mu of LZB": (lambda: ji.LZB(0.5, friction=-0.1), "`friction`.*-0.1"),
     "nan": (lambda: ji.RestitutionMatrix([[0.5]], friction=np.nan), "`friction`"),
     "e_t": (
         lambda: ji.Newton(0.5, friction=0.1, tangential_restitution=1.1),
         "`tangential_restitution`",
     ),
-    "e_t alone": (lambda: ji.Newton(0.5, tangential_restitution=0.3), "without `friction`"),
+    "e_t alone": (
+        lambda: ji.Newton(0.5, tangential_restitution=0.3),
+        "without `friction`",
+    ),
     "chain": (
-        lambda: ji.impact(ji.Newton(0.5, friction=0.1), ji.chain([1.0, 1.0]), [1.0, 0.0]),
+        lambda: ji.impact(
+            ji.Newton(0.5, friction=0.1), ji.chain([1.0, 1.0]), [1.0, 0.0]
+        ),
         "`scene`.*tangents.*`friction`",
     ),
     "no tangents": (
@@ -664,7 +744,9 @@ BAD = {
         "`friction`",
     ),
     "both": (
-        lambda: ji.impact(ji.RestitutionMatrix(np.eye(3), friction=0.1), FLAT, [0.0, -1.0, 0.0]),
+        lambda: ji.impact(
+            ji.RestitutionMatrix(np.eye(3), friction=0.1), FLAT, [0.0, -1.0, 0.0]
+        ),
         "`matrix`.*`friction`",
     ),
     "method": (lambda: ji.LZB(0.8, friction=0.1, method="impulse"), "`method`"),
@@ -702,7 +784,10 @@ def cube(row):
     lowest = np.sort(np.argsort(gaps, kind="stable")[: int(row["contacts"])])
     arms = (0.0474 * CORNERS[lowest] - [0, 0, 0.0057]) @ turn.T - [0, 0, 0.0036]
     points = np.array(  # velocity (3,) of each corner from that of the body
-        [np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]]) for x, y, z in arms]
+        [
+            np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+            for x, y, z in arms
+        ]
     )
     v = [row[f"{name}_{c}_pre_{unit}"] for name, unit in RATES for c in "xyz"]
     return mass, points[:, 2].T, points[:, :2].reshape(-1, 6).T, np.array(v)
@@ -718,7 +803,9 @@ def test_lzb_of_a_real_cube(contacts):
     rows = cube_impacts()[cube_impacts()["contacts"] == contacts]
     scenes = [np.stack(x) for x in zip(*map(cube, rows))]
     out, found = run("lzb", *scenes, np.full(len(rows), 0.27), rows["mu"])
-    after = np.stack([rows[f"lzb_{name}_{c}"] for name, _ in RATES for c in "xyz"], axis=1)
+    after = np.stack(
+        [rows[f"lzb_{name}_{c}"] for name, _ in RATES for c in "xyz"], axis=1
+    )
     assert not out.status.any()
     assert found.consistent.all()
     close(out.velocity, after, atol=5e-7)
@@ -736,12 +823,16 @@ def test_slopes_where_a_real_cube_comes_to_stick():
     def along(given, way, mass, normals, tangents, v):
         def after(given):
             law = ji.LZB(given[1], friction=given[0])
-            return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v).velocity
+            return ji.impact(
+                law, ji.Scene(mass, normals, tangents=tangents), v
+            ).velocity
 
         return jax.jvp(after, (given,), (way,))
 
     step, shifts = 1e-4, (0, 1, -1)
-    lanes = [(given + s * step * way, way + 0 * given) for way in np.eye(2) for s in shifts]
+    lanes = [
+        (given + s * step * way, way + 0 * given) for way in np.eye(2) for s in shifts
+    ]
     x, ways = (np.concatenate(part) for part in zip(*lanes))
     v, slope = along(x, ways, *(np.concatenate([y] * len(lanes)) for y in scenes))
     v, slope = (np.asarray(y).reshape(2, 3, len(rows), 6) for y in (v, slope))
@@ -779,19 +870,29 @@ def test_slope_of_a_contact_that_falls_straight(kind):
     scene = body.scene(body.touching())
     h, mass = np.asarray(scene.tangents), np.asarray(scene.mass)
     normal = np.asarray(scene.normals)[:, 0]
-    moves = np.linalg.solve(np.diag(mass), h) if mass.ndim == 1 else np.linalg.solve(mass, h)
+    moves = (
+        np.linalg.solve(np.diag(mass), h)
+        if mass.ndim == 1
+        else np.linalg.solve(mass, h)
+    )
     right = np.eye(len(v)) - moves @ np.linalg.solve(h.T @ moves, h.T)
     right[np.ix_(normal != 0, normal != 0)] = -0.6
     law = ji.LZB(0.6, friction=0.2)
     for jacobian in (jax.jacfwd, jax.jacrev):
-        close(jacobian(lambda v: ji.impact(law, scene, v).velocity)(v), right, atol=1e-7)
+        close(
+            jacobian(lambda v: ji.impact(law, scene, v).velocity)(v), right, atol=1e-7
+        )
 
 
 @pytest.mark.slow
 def test_slope_of_a_block_that_falls_flat():
     """Both corners stick at once: differences meet the slope as they shrink, like h^0.4."""
     block = ji.Block(0.5, 0.3)
-    scene, law, v = block.scene(block.touching()), ji.LZB(0.4, friction=0.5), np.array([0, -1.0, 0])
+    scene, law, v = (
+        block.scene(block.touching()),
+        ji.LZB(0.4, friction=0.5),
+        np.array([0, -1.0, 0]),
+    )
 
     @jax.jit
     def after(v):
@@ -799,7 +900,10 @@ def test_slope_of_a_block_that_falls_flat():
 
     slope, way = jax.jacfwd(after)(v) @ np.eye(3)[0], np.eye(3)[0]
     steps = np.array([1e-4, 1e-6])
-    off = [np.abs((after(v + s * way) - after(v - s * way)) / (2 * s) - slope).max() for s in steps]
+    off = [
+        np.abs((after(v + s * way) - after(v - s * way)) / (2 * s) - slope).max()
+        for s in steps
+    ]
     assert off[1] < 0.3 * off[0] < 0.3 * 0.3
 
 

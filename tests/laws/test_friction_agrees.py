@@ -41,12 +41,15 @@ def random_scene(rng):
         sides = (body + 1, -width[body + 1]), (body, width[body])
         for rows, way in ((normals, (1, 0)), (tangents, (0, 1))):
             rows.append(
-                row(sides[0][0], way, sides[0][1], y) - row(sides[1][0], way, sides[1][1], y)
+                row(sides[0][0], way, sides[0][1], y)
+                - row(sides[1][0], way, sides[1][1], y)
             )
     mass = rng.uniform(0.1, 2.0, 3)
     square = np.zeros(3)
     square[:bodies] = width**2 + height**2
-    mass = np.stack([mass, mass, mass * np.where(square > 0, square, 1.0) / 3], axis=1).ravel()
+    mass = np.stack(
+        [mass, mass, mass * np.where(square > 0, square, 1.0) / 3], axis=1
+    ).ravel()
     v = rng.normal(size=9) * np.repeat(rng.uniform(size=3) < 0.6, 3)
     v[:3] += [0.5, -1.0, 0.0]
     mu = rng.choice([0.0, rng.uniform(0, 1.5), 1.5], p=[0.05, 0.9, 0.05])
@@ -111,7 +114,9 @@ def lifted(scenes):
     for body in range(3):
         here = moves[:, 3 * body] | moves[:, 3 * body + 1]
         across[:, 3 * body] = here
-        across[:, 3 * body + 1 : 3 * body + 3] = 0.1 * here[:, None]  # levers of the tilts [m]
+        across[:, 3 * body + 1 : 3 * body + 3] = (
+            0.1 * here[:, None]
+        )  # levers of the tilts [m]
     sides = np.stack([np.concatenate([x, none], 1) for x in (tangents,)] * 2, axis=3)
     sides[..., 1] = np.concatenate([none, across], axis=1)
     return [
@@ -196,13 +201,25 @@ def test_poisson_depends_on_how_redundant_contacts_share_compression():
     In single precision the same outcomes are found (the last three: `infeasible` with coarse
     perturbations of regular modes).
     """
-    spread = {9: 0.0448, 62: 0.411, 2: 0.208, 0: 0, 98: 0, 287: 0, 1347: 0, 1853: 0, 2065: 0}
+    spread = {
+        9: 0.0448,
+        62: 0.411,
+        2: 0.208,
+        0: 0,
+        98: 0,
+        287: 0,
+        1347: 0,
+        1853: 0,
+        2065: 0,
+    }
     scenes = redundant(list(spread))
 
     @jax.jit
     @jax.vmap
     def run(mass, normals, tangents, v, e, mu):
-        return ji.impact(ji.Poisson(e, friction=mu), ji.Scene(mass, normals, tangents), v)
+        return ji.impact(
+            ji.Poisson(e, friction=mu), ji.Scene(mass, normals, tangents), v
+        )
 
     out, single = run(*scenes), run(*(x.astype(np.float32) for x in scenes))
     several = [ji.STATUS[code].name == "several_outcomes" for code in out.status]

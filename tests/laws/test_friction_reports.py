@@ -37,12 +37,16 @@ def test_damped_forces_keep_rtol(friction):
     force = ji.KelvinVoigt([1e4, 1.7e4], 20.0)
     exact, coarse = (
         ji.impact(
-            ji.Compliant(force, friction=friction, method=method, rtol=rtol), on_an_edge(), VELOCITY
+            ji.Compliant(force, friction=friction, method=method, rtol=rtol),
+            on_an_edge(),
+            VELOCITY,
         )
         for method, rtol in RTOL.items()
     )
     speed = np.abs(VELOCITY).max()
-    np.testing.assert_allclose(coarse.velocity, exact.velocity, atol=2 * RTOL["implicit"] * speed)
+    np.testing.assert_allclose(
+        coarse.velocity, exact.velocity, atol=2 * RTOL["implicit"] * speed
+    )
 
 
 @pytest.mark.slow
@@ -55,14 +59,24 @@ def test_what_rtol_allows_is_no_gain_of_energy():
     assert float(out.accuracy) == pytest.approx(1e-4)
     assert "VIOLATED" not in ji.summary(out, scene, v)
     gained = ji.Impact(
-        out.velocity * 1.001, out.impulse, out.tangential_impulse, 1e-3, 0.0, 0, out.accuracy
+        out.velocity * 1.001,
+        out.impulse,
+        out.tangential_impulse,
+        1e-3,
+        0.0,
+        0,
+        out.accuracy,
     )
     assert not ji.audit(gained, scene, v).energetic
 
 
 def test_parameters_of_a_force_of_ones_own_may_be_one_array():
-    force = ji.UserForce(lambda x, rate, p: p[0] * x + p[1] * rate, jnp.array([1.0, 0.2]))
-    assert float(ji.measured_restitution(force, 1.0, 1.0)) == pytest.approx(0.74408, abs=1e-5)
+    force = ji.UserForce(
+        lambda x, rate, p: p[0] * x + p[1] * rate, jnp.array([1.0, 0.2])
+    )
+    assert float(ji.measured_restitution(force, 1.0, 1.0)) == pytest.approx(
+        0.74408, abs=1e-5
+    )
 
 
 def test_a_law_says_what_it_takes():
@@ -74,9 +88,13 @@ def test_a_law_says_what_it_takes():
 
 def test_open_contacts_that_a_law_leaves_out_are_named():
     scene = ji.chain([1.0, 1.0, 1.0], gaps=[1e-5, 0.0])
-    with pytest.warns(UserWarning, match="only open contacts .* LZB leaves them out") as caught:
+    with pytest.warns(
+        UserWarning, match="only open contacts .* LZB leaves them out"
+    ) as caught:
         out = ji.impact(ji.LZB(0.9), scene, [1.0, 0.0, 0.0])
     assert caught[0].filename == __file__
-    v = jnp.array([1.0, 0.0, 0.0])  # inside jit the scene is known, its normals are traced
+    v = jnp.array(
+        [1.0, 0.0, 0.0]
+    )  # inside jit the scene is known, its normals are traced
     jax.eval_shape(lambda k: ji.impact(ji.LZB(0.9, k), scene, v).velocity, jnp.ones(2))
     assert "Compliant and Binary" in ji.summary(out, scene, [1.0, 0.0, 0.0])

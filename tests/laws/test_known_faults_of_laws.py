@@ -16,7 +16,10 @@ def status_of(out):
 def row_of_points(heights, columns):
     """A flat planar body (x, z, turn) on some columns; beside it points that only fall."""
     n = 3 + heights
-    normals, tangents = np.zeros((n, len(columns) + heights)), np.zeros((n, len(columns) + heights))
+    normals, tangents = (
+        np.zeros((n, len(columns) + heights)),
+        np.zeros((n, len(columns) + heights)),
+    )
     for j, x in enumerate(columns):
         normals[:3, j], tangents[:3, j] = (0, 1, x), (1, 0, 0.1)
     for j in range(heights):
@@ -61,10 +64,14 @@ def test_one_outcome_is_not_several():
 
     def rates(lever):
         x, y, z = lever
-        return np.array([[1, 0, 0, 0, z, -y], [0, 1, 0, -z, 0, x], [0, 0, 1, y, -x, 0]], float)
+        return np.array(
+            [[1, 0, 0, 0, z, -y], [0, 1, 0, -z, 0, x], [0, 0, 1, y, -x, 0]], float
+        )
 
     nose, cloth = rates(r * np.array([0, side, up])), rates(r * np.array([0, 0, -1.0]))
-    normals = np.stack([np.array([0, -side, -up]) @ nose, np.array([0, 0, 1.0]) @ cloth], 1)
+    normals = np.stack(
+        [np.array([0, -side, -up]) @ nose, np.array([0, 0, 1.0]) @ cloth], 1
+    )
     along_nose = np.array([[1, 0, 0], [0, -up, side]]) @ nose
     tangents = np.concatenate([along_nose, np.eye(3)[:2] @ cloth]).T
     scene = ji.Scene([m, m, m, inertia, inertia, inertia], normals, tangents)
@@ -74,13 +81,20 @@ def test_one_outcome_is_not_several():
 
 
 def test_restitution_of_a_force_whose_parameters_are_one_array():
-    force = ji.UserForce(lambda x, rate, p: p[0] * x + p[1] * rate, jnp.array([1.0, 0.2]))
-    assert float(ji.measured_restitution(force, 1.0, 1.0)) == pytest.approx(0.74408, abs=1e-5)
+    force = ji.UserForce(
+        lambda x, rate, p: p[0] * x + p[1] * rate, jnp.array([1.0, 0.2])
+    )
+    assert float(ji.measured_restitution(force, 1.0, 1.0)) == pytest.approx(
+        0.74408, abs=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("make", "word"),
-    [(lambda: ji.Compliant(stiffness=1e9), "force"), (lambda: ji.LZB(e=0.9), "restitution")],
+    [
+        (lambda: ji.Compliant(stiffness=1e9), "force"),
+        (lambda: ji.LZB(e=0.9), "restitution"),
+    ],
 )
 def test_arguments_that_a_law_does_not_take(make, word):
     with pytest.raises(TypeError, match=f"takes .*`{word}`"):
@@ -115,16 +129,22 @@ def test_impulses_that_wedge_do_not_hide_their_errors():
     assert float(out.impulse.max()) < 10
     stick, rates = np.array([0, 2, 3]), np.array(normals).T @ out.velocity
     np.testing.assert_allclose(rates[stick], 0, atol=1e-12)
-    np.testing.assert_allclose((np.array(tangents).T @ out.velocity)[stick], 0, atol=1e-12)
+    np.testing.assert_allclose(
+        (np.array(tangents).T @ out.velocity)[stick], 0, atol=1e-12
+    )
     assert (rates[np.array([1, 4])] > 0.5).all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", [ji.Disc(0.1).scene(), ji.Box((1.0, 1.0, 1.0)).scene()])
+@pytest.mark.parametrize(
+    "scene", [ji.Disc(0.1).scene(), ji.Box((1.0, 1.0, 1.0)).scene()]
+)
 def test_contacts_without_friction_do_not_stick(scene):
     """A friction of 0 holds nothing, also where nothing slips: the slope was that of sticking."""
     strike = -np.eye(scene.size)[{3: 1, 6: 2}[scene.size]]  # downwards
-    slope = jax.jacfwd(lambda v: ji.impact(ji.Moreau(0.5, 0.0), scene, v).velocity)(strike)
+    slope = jax.jacfwd(lambda v: ji.impact(ji.Moreau(0.5, 0.0), scene, v).velocity)(
+        strike
+    )
     np.testing.assert_allclose(slope[0], np.eye(scene.size)[0], atol=1e-12)
 
 
@@ -133,7 +153,10 @@ def test_contacts_without_friction_do_not_stick(scene):
 def test_restitution_of_poisson_begins_at_0(levers):
     """At e = 0 expansion acted on what rounding had left of compression: slopes of sliding."""
     m = len(levers)
-    normals, tangents = np.array([[0] * m, [1] * m, levers]), np.array([[1], [0], [-0.5]])
+    normals, tangents = (
+        np.array([[0] * m, [1] * m, levers]),
+        np.array([[1], [0], [-0.5]]),
+    )
     scene = ji.Scene([1.0, 1.0, 0.2], normals, tangents=np.tile(tangents, (1, m)))
 
     def after(e):

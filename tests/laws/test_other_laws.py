@@ -10,7 +10,9 @@ from programs import State, chain
 import jimpact as ji
 
 LZB_AFTER = np.array([-0.0086153561548806457, 0.10414279851550412, 0.90447255763937653])
-LZB_ELASTIC = np.array([-0.070952353651436871, 0.076403039071206993, 0.994549314580229878])
+LZB_ELASTIC = np.array(
+    [-0.070952353651436871, 0.076403039071206993, 0.994549314580229878]
+)
 
 
 def correlated(e, ratio, v=1.0):
@@ -56,15 +58,23 @@ def test_impulse_ratios_are_not_constant():
 @pytest.mark.parametrize(
     ("ratio", "says"),
     [
-        (0.4, r"`ratio` must lie in \[0\.5, 0\.948753\] for contact 1 beside contact 0"),
+        (
+            0.4,
+            r"`ratio` must lie in \[0\.5, 0\.948753\] for contact 1 beside contact 0",
+        ),
         ([0.6, 0.96], r"for contact 1 beside contact 0, but has value 0\.96"),
-        ([[0.0, 0.6], [0.3, 0.0]], r"for contact 0 beside contact 1, but has value 0\.3"),
+        (
+            [[0.0, 0.6], [0.3, 0.0]],
+            r"for contact 0 beside contact 1, but has value 0\.3",
+        ),
         (-0.1, r"`ratio` must lie in \[0, inf\)"),
     ],
 )
 def test_ratios_outside_their_interval_are_refused(ratio, says):
     with pytest.raises(ValueError, match=says):
-        ji.impact(ji.ImpulseCorrelation(0.9, ratio), ji.chain([1.0] * 3), [1.0, 0.0, 0.0])
+        ji.impact(
+            ji.ImpulseCorrelation(0.9, ratio), ji.chain([1.0] * 3), [1.0, 0.0, 0.0]
+        )
 
 
 def test_ratios_are_checked_inside_jit():
@@ -72,7 +82,9 @@ def test_ratios_are_checked_inside_jit():
     balls = ji.chain([1.0, 1.0, 1.0])
 
     def shape(law):
-        return jax.eval_shape(lambda v: ji.impact(law, balls, v).velocity, np.ones(3)).shape
+        return jax.eval_shape(
+            lambda v: ji.impact(law, balls, v).velocity, np.ones(3)
+        ).shape
 
     assert shape(ji.ImpulseCorrelation(0.9, 0.6)) == (3,)
     with pytest.raises(ValueError, match="`ratio` must lie in"):
@@ -89,7 +101,10 @@ def test_a_matrix_of_ratios_is_that_of_each_contact_that_collides():
         return ji.impact(ji.ImpulseCorrelation(0.9, ratio), balls, v)
 
     ratio = np.array([[0.0, 0.6], [0.9, 0.0]])
-    first, last = after(ratio, np.array([1.0, 0, 0])), after(ratio, np.array([0.0, 0, -1]))
+    first, last = (
+        after(ratio, np.array([1.0, 0, 0])),
+        after(ratio, np.array([0.0, 0, -1])),
+    )
     np.testing.assert_allclose(first.velocity, correlated(0.9, 0.6), atol=1e-12)
     np.testing.assert_allclose(-last.velocity[::-1], correlated(0.9, 0.9), atol=1e-12)
     wrong = after(np.array([[0.0, 0.97], [0.9, 0.0]]), np.array([1.0, 0, 0]))
@@ -103,7 +118,9 @@ def test_statement_of_bowling():
     normals = np.array([[1.0, 0], [0, 1], [0, 0]])
     right = State(np.diag([1.0, 2, 3]), normals, [-1.0, -0.4, 0.3], e=0.7, k=[1, 30.0])
     balls = chain([1.0, 1, 1], [1.0, 0, 0], e=0.7)
-    routh, lzb = (programs.values(name)([one, right, balls])[0] for name in ("routh", "lzb"))
+    routh, lzb = (
+        programs.values(name)([one, right, balls])[0] for name in ("routh", "lzb")
+    )
     np.testing.assert_allclose(routh.velocity[:2], lzb.velocity[:2], atol=1e-7)
     assert np.abs(routh.velocity[2] - lzb.velocity[2]).max() > 0.1
 
@@ -131,7 +148,9 @@ def test_hurmuzlu_and_marghitu_is_moreau():
         masses, e = rng.uniform(0.3, 3, 4), rng.uniform(0.2, 1)
         normals = np.diff(np.eye(4), axis=0).T
         w = normals.T @ (normals / masses[:, None])
-        d = np.append(1.0, -np.linalg.solve(w[1:, 1:], w[1:, 0]))  # all stay closed in a chain
+        d = np.append(
+            1.0, -np.linalg.solve(w[1:, 1:], w[1:, 0])
+        )  # all stay closed in a chain
         assert (d > 0).all()
         p = (1 + e) / (w[0] @ d) * d  # contact 1 alone works: gamma_1 rises in a line
         states.append(chain(masses, [1.0, 0, 0, 0], e=e))
@@ -191,6 +210,10 @@ def test_slopes_of_routh_in_each_restitution_at_zero():
     for e in (0.0, 0.4):
         expected = np.zeros((4, 3))
         expected[:, 1] = normals @ pressed / masses
-        np.testing.assert_allclose(slopes(np.array([0.0, e, 0.0])), expected, atol=1e-12)
-    backwards = jax.jacrev(lambda e: ji.impact(ji.Routh(e), balls, v).velocity)(np.zeros(3))
+        np.testing.assert_allclose(
+            slopes(np.array([0.0, e, 0.0])), expected, atol=1e-12
+        )
+    backwards = jax.jacrev(lambda e: ji.impact(ji.Routh(e), balls, v).velocity)(
+        np.zeros(3)
+    )
     np.testing.assert_allclose(backwards, slopes(np.zeros(3)), atol=1e-12)

@@ -21,7 +21,9 @@ SIDE_BY_SIDE = 0.7 + ULP * np.array(list(itertools.product(range(-2, 3), repeat=
 
 
 def statuses(law, scene, states):
-    return np.asarray(jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).status))(states))
+    return np.asarray(
+        jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).status))(states)
+    )
 
 
 def test_one_unit_in_the_last_place_is_no_impact():
@@ -104,7 +106,9 @@ def test_poisson_with_friction():
         return ji.impact(ji.Poisson(e, mu, e_t), scene, v), plastic
 
     out, first = run(mass, normals, tangents, v, e, mu)
-    assert not np.isin(out.status, [c for c, row in enumerate(ji.STATUS) if row.failure]).any()
+    assert not np.isin(
+        out.status, [c for c, row in enumerate(ji.STATUS) if row.failure]
+    ).any()
     expansion = out.impulse - first.impulse
     supplement = expansion - e * first.impulse
     side = out.tangential_impulse - first.tangential_impulse
@@ -113,7 +117,9 @@ def test_poisson_with_friction():
     np.testing.assert_allclose(np.minimum(supplement, gamma), 0.0, atol=1e-12)
     assert (np.abs(side) <= mu * expansion + 1e-12).all()
     slides = np.abs(slip) > 1e-10
-    np.testing.assert_allclose((side + mu * expansion * np.sign(slip))[slides], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        (side + mu * expansion * np.sign(slip))[slides], 0.0, atol=1e-12
+    )
     assert slides.any()
     assert not slides.all()
 
@@ -139,12 +145,16 @@ TOUCHY = (  # masses, e, k
 )
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)]
+)
 def test_ill_conditioned_is_reported_and_nothing_else_is(dtype):
     @jax.jit
     @jax.vmap
     def reported(masses, e, k, v):
-        return ji.impact(ji.LZB(e, k, check_conditioning=True), ji.chain(masses), v).status
+        return ji.impact(
+            ji.LZB(e, k, check_conditioning=True), ji.chain(masses), v
+        ).status
 
     plain = [np.ones(4), np.full(3, 0.9), np.ones(3)]
     v = np.array([1.0, 0.0, 0.0, 0.0])
@@ -192,6 +202,8 @@ def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
     def last(e, check):
         return ji.impact(ji.LZB(e, check_conditioning=check), balls, v).velocity[2]
 
-    slopes = [jax.jit(jax.grad(lambda e, c=check: last(e, c))) for check in (False, True)]
+    slopes = [
+        jax.jit(jax.grad(lambda e, c=check: last(e, c))) for check in (False, True)
+    ]
     plain, checked = (slope(jnp.array([0.9, 0.8])) for slope in slopes)
     np.testing.assert_allclose(plain, checked, rtol=1e-9)

@@ -30,12 +30,20 @@ def test_contacts_that_do_not_feel_each_other_are_solved_apart():
 def test_open_contacts_in_space_have_no_slip():
     """Contact-major rows, two for each contact: the first contact is open, the second closed."""
     rng = np.random.default_rng(2)
-    normals, tangents, v = rng.normal(size=(4, 2)), rng.normal(size=(4, 4)), rng.normal(size=4)
+    normals, tangents, v = (
+        rng.normal(size=(4, 2)),
+        rng.normal(size=(4, 4)),
+        rng.normal(size=4),
+    )
     scene = ji.Scene(np.ones(4), normals, tangents=tangents, gaps=[0.1, 0.0])
     block = contact_of(scene, jnp.asarray(v)).tangential_block
-    np.testing.assert_allclose(block.slip, [0.0, 0.0, *(tangents[:, 2:].T @ v)], atol=1e-15)
+    np.testing.assert_allclose(
+        block.slip, [0.0, 0.0, *(tangents[:, 2:].T @ v)], atol=1e-15
+    )
     np.testing.assert_allclose(block.normal_tangent[0], 0.0)
-    np.testing.assert_allclose(block.normal_tangent[1, 2:], normals[:, 1] @ tangents[:, 2:])
+    np.testing.assert_allclose(
+        block.normal_tangent[1, 2:], normals[:, 1] @ tangents[:, 2:]
+    )
 
 
 class Gains(ji.Law):
@@ -68,10 +76,15 @@ def test_a_padded_chain_contains_itself(wall):
     padded = pad_scene(chain, 8)
     np.testing.assert_array_equal(padded.scene.mass[padded.coordinates], masses)
     np.testing.assert_array_equal(padded.scene.gaps[padded.contacts], chain.gaps)
-    np.testing.assert_array_equal(padded.copied[padded.contacts], np.arange(chain.contacts))
+    np.testing.assert_array_equal(
+        padded.copied[padded.contacts], np.arange(chain.contacts)
+    )
     whole = np.asarray(padded.scene.normals)[padded.coordinates, padded.contacts]
     np.testing.assert_array_equal(whole, chain.normals)
-    assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
+    assert (
+        np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts])
+        > 0
+    ).all()
 
 
 @pytest.mark.slow
@@ -80,12 +93,16 @@ def test_groups_with_friction_and_open_contacts():
     for j in range(3):
         normals[2 * j + 1, j] = tangents[2 * j, j] = 1.0
     tangents[1, 0] = 0.3
-    three = ji.Scene(np.linspace(1.0, 2.0, 6), normals, tangents=tangents, gaps=[0.0, 0.0, 0.1])
+    three = ji.Scene(
+        np.linspace(1.0, 2.0, 6), normals, tangents=tangents, gaps=[0.0, 0.0, 0.1]
+    )
     assert [g.tolist() for g in coupled_groups(three)] == [[[0], [1]]]
     v = np.array([0.5, -1.0, 0.1, -1.0, 1.0, -1.0])
     law = ji.Moreau([0.5, 0.2, 0.1], [0.3, 0.2, 0.1])
     whole = jax.jit(lambda scene: ji.impact(law, scene, v))(three)
     apart = ji.impact(law, three, v)
     for name in ("velocity", "impulse", "tangential_impulse", "energy_change"):
-        np.testing.assert_allclose(getattr(apart, name), getattr(whole, name), atol=1e-14)
+        np.testing.assert_allclose(
+            getattr(apart, name), getattr(whole, name), atol=1e-14
+        )
     assert apart.velocity[4:].tolist() == [1.0, -1.0]

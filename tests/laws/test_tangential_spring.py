@@ -19,21 +19,35 @@ def after(q, mass, normals, tangents, rtol):
     m = normals.shape[1]
     mu, kappa, e, eta, k = q[: 5 * m].reshape(5, m)
     law = ji.LZB(e, k, eta, friction=mu, tangential_stiffness=kappa)
-    out = ji.impact(law, ji.Scene(mass, normals, tangents=tangents), q[5 * m :], rtol=rtol)
+    out = ji.impact(
+        law, ji.Scene(mass, normals, tangents=tangents), q[5 * m :], rtol=rtol
+    )
     return out.velocity, out.status
 
 
 @functools.cache
 def program():
     """Compiled once a shape; a lane for each impact."""
-    return jax.jit(jax.vmap(after, in_axes=(0, 0, 0, 0, None)), compiler_options=OPTIMIZED)
+    return jax.jit(
+        jax.vmap(after, in_axes=(0, 0, 0, 0, None)), compiler_options=OPTIMIZED
+    )
 
 
 def of_contacts(rng, m):
     """Random mu, kappa, e, eta, k."""
-    mu, kappa, e = rng.uniform(0.05, 1, m), rng.uniform(0.2, 1.5, m), rng.uniform(0.3, 1, m)
+    mu, kappa, e = (
+        rng.uniform(0.05, 1, m),
+        rng.uniform(0.2, 1.5, m),
+        rng.uniform(0.3, 1, m),
+    )
     return np.concatenate(
-        [mu, kappa, e, [rng.choice([1.0, 1.5, 1.8])] * m, 10 ** rng.uniform(-0.5, 0.5, m)]
+        [
+            mu,
+            kappa,
+            e,
+            [rng.choice([1.0, 1.5, 1.8])] * m,
+            10 ** rng.uniform(-0.5, 0.5, m),
+        ]
     )
 
 
@@ -61,7 +75,12 @@ def spheres(count, seed):
         normals = np.array([[0.0, 0.0], [1.0, 0.0], [a, 1.0]])
         tangents = np.array([[1.0, 0.3], [0.0, 0.0], [1.0, 0.0]])
         v = np.array([1.5 * rng.normal(), -1.0, 0.5 * rng.normal()])
-        yield np.concatenate([of_contacts(rng, 2), v]), np.array([1.0, 1.0, 0.4]), normals, tangents
+        yield (
+            np.concatenate([of_contacts(rng, 2), v]),
+            np.array([1.0, 1.0, 0.4]),
+            normals,
+            tangents,
+        )
 
 
 def in_space(count, seed):
@@ -103,7 +122,8 @@ def test_gross_sliding_is_waltons():
 
 
 @pytest.mark.parametrize(
-    "states", [(spheres, blocks), pytest.param((spheres_in_space,), marks=pytest.mark.slow)]
+    "states",
+    [(spheres, blocks), pytest.param((spheres_in_space,), marks=pytest.mark.slow)],
 )
 def test_impacts_are_those_of_an_own_integration(states):
     """v+ within 10 rtol of scipy's DOP853 from event to event."""
@@ -116,12 +136,16 @@ def test_impacts_are_those_of_an_own_integration(states):
             continue
         m = normals.shape[1]
         mu, kappa, e, eta, k = q[: 5 * m].reshape(5, m)
-        expected = Springs(mass, normals, tangents, mu, kappa, e, k, eta).after(q[5 * m :])
+        expected = Springs(mass, normals, tangents, mu, kappa, e, k, eta).after(
+            q[5 * m :]
+        )
         close(v, expected, atol=1e-7 * np.abs(q[5 * m :]).max())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [blocks, pytest.param(in_space, marks=pytest.mark.release)])
+@pytest.mark.parametrize(
+    "make", [blocks, pytest.param(in_space, marks=pytest.mark.release)]
+)
 def test_derivatives_are_differences(make):
     """In mu, kappa, e, eta, k and v-, forward and reverse."""
     cases = [np.stack(x) for x in zip(*make(6, 9))]
@@ -135,7 +159,9 @@ def test_derivatives_are_differences(make):
     def difference(i, h):
         step = np.zeros(cases[0].shape[1])
         step[i] = h
-        up, down = (program()(cases[0] + s * step, *cases[1:], 1e-12)[0] for s in (1, -1))
+        up, down = (
+            program()(cases[0] + s * step, *cases[1:], 1e-12)[0] for s in (1, -1)
+        )
         return (np.asarray(up) - np.asarray(down)) / (2 * h)
 
     for i in range(cases[0].shape[1]):
@@ -151,7 +177,11 @@ def test_history_balances_energies():
     law = ji.LZB(1.0, 2.0, 1.0, friction=0.8, tangential_stiffness=0.5)
     course = ji.history(law, scene, [0.3, -1.0, 0.0], samples=60)
     kinetic = 0.5 * (np.asarray(course.velocity) ** 2 @ np.asarray(mass))
-    whole = kinetic + np.asarray(course.energy).sum(1) + np.asarray(course.tangential_energy).sum(1)
+    whole = (
+        kinetic
+        + np.asarray(course.energy).sum(1)
+        + np.asarray(course.tangential_energy).sum(1)
+    )
     cone = 0.8 * np.asarray(course.force) + 1e-7
     assert (np.abs(course.tangential_force) <= cone).all()
     holds = np.abs(course.tangential_force[:, 0]) < 0.999 * cone[:, 0] - 1e-6
@@ -169,7 +199,9 @@ def test_hertz_may_gain_and_says_so():
     """k_t changes with x, and what that gives comes from nowhere: status `energy_gain`."""
     mass, normals, tangents = SPHERE
     scene = ji.Scene(mass, normals, tangents=tangents)
-    out = ji.impact(ji.LZB(1.0, friction=3.6, tangential_stiffness=0.97), scene, [-2.44, -1.0, 0.0])
+    out = ji.impact(
+        ji.LZB(1.0, friction=3.6, tangential_stiffness=0.97), scene, [-2.44, -1.0, 0.0]
+    )
     assert ji.STATUS[int(out.status)].name == "energy_gain"
     assert not bool(ji.audit(out, scene, [-2.44, -1.0, 0.0]).energetic)
 
@@ -189,15 +221,23 @@ def test_stiff_springs_are_rigid_contacts():
 
 
 REFUSED = {
-    "zero": (lambda: ji.LZB(0.5, friction=0.1, tangential_stiffness=0.0), "tangential_stiffness"),
-    "nan": (lambda: ji.LZB(0.5, friction=0.1, tangential_stiffness=np.nan), "tangential_stiffness"),
+    "zero": (
+        lambda: ji.LZB(0.5, friction=0.1, tangential_stiffness=0.0),
+        "tangential_stiffness",
+    ),
+    "nan": (
+        lambda: ji.LZB(0.5, friction=0.1, tangential_stiffness=np.nan),
+        "tangential_stiffness",
+    ),
     "without mu": (lambda: ji.LZB(0.5, tangential_stiffness=0.5), "`friction`"),
     "compliant without mu": (
         lambda: ji.Compliant(ji.Hertz(1.0), tangential_stiffness=0.5),
         "`friction`",
     ),
     "viscous": (
-        lambda: ji.Compliant(ji.KelvinVoigt(1.0, 0.1), friction=0.1, tangential_stiffness=0.5),
+        lambda: ji.Compliant(
+            ji.KelvinVoigt(1.0, 0.1), friction=0.1, tangential_stiffness=0.5
+        ),
         "`tangential_stiffness`.*rate",
     ),
     "implicit": (
@@ -206,7 +246,9 @@ REFUSED = {
     ),
     "no tangents": (
         lambda: ji.impact(
-            ji.LZB(0.5, friction=0.1, tangential_stiffness=0.5), ji.chain([1.0, 1.0]), [1.0, 0.0]
+            ji.LZB(0.5, friction=0.1, tangential_stiffness=0.5),
+            ji.chain([1.0, 1.0]),
+            [1.0, 0.0],
         ),
         "tangents",
     ),

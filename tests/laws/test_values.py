@@ -10,7 +10,9 @@ from programs import State, chain, check_held
 
 import jimpact as ji
 
-HELD = json.loads((Path(__file__).parents[1] / "held" / "lzb_check_values.json").read_text())
+HELD = json.loads(
+    (Path(__file__).parents[1] / "held" / "lzb_check_values.json").read_text()
+)
 
 
 def held_states(most=4):
@@ -23,7 +25,17 @@ def held_states(most=4):
         )
         if len(k) < most:
             states.append(
-                chain(m, v, data["wall"], e=e, k=k, eta=eta, after=after, impulse=p, name=name)
+                chain(
+                    m,
+                    v,
+                    data["wall"],
+                    e=e,
+                    k=k,
+                    eta=eta,
+                    after=after,
+                    impulse=p,
+                    name=name,
+                )
             )
     return states
 
@@ -37,7 +49,10 @@ def flat_block(a, rates, **given):
     """Rocking block at theta = 0, m = L = 1, aspect a; coordinates (y, theta)."""
     normals = np.array([[1.0, 1.0], [0.5, -0.5]])
     state = State(
-        np.diag([1, (a**2 + 1) / 12]), normals, np.linalg.solve(normals.T, rates), **given
+        np.diag([1, (a**2 + 1) / 12]),
+        normals,
+        np.linalg.solve(normals.T, rates),
+        **given,
     )
     state.after = np.linalg.solve(normals.T, state.after)
     return state
@@ -140,7 +155,9 @@ def test_many_closings():
 PLASTIC = [chain([1, 1, 1], [1, 0, 0], e=0.0), chain([3, 1, 2], [1, 0.4, -0.5], e=0.0)]
 
 
-@pytest.mark.parametrize("name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)]
+)
 def test_plastic_contacts_share_a_velocity(name):
     out, _ = programs.values(name)(PLASTIC)
     for i, state in enumerate(PLASTIC):
@@ -185,10 +202,16 @@ def test_lzb_between_the_limits():
     """k2/k1 -> 0: binary collisions; a symmetric impact stays so; redundant contacts share."""
     states = [
         chain(
-            [1, 2, 3], [1, 0, 0], e=[0.9, 0.8], k=[1, 1e-7], after=[-4 / 15, -19 / 375, 57 / 125]
+            [1, 2, 3],
+            [1, 0, 0],
+            e=[0.9, 0.8],
+            k=[1, 1e-7],
+            after=[-4 / 15, -19 / 375, 57 / 125],
         ),
         chain([1, 4, 1], [1, 0, -1], e=0.7, k=2.0),
-        State(np.eye(2), np.array([[1.0, 1.0], [0, 0]]), [-1, 0], e=[0.5, 0.8], k=[1, 3]),
+        State(
+            np.eye(2), np.array([[1.0, 1.0], [0, 0]]), [-1, 0], e=[0.5, 0.8], k=[1, 3]
+        ),
     ]
     out = check_held("lzb", states, allowed=1e-6)
     np.testing.assert_allclose(out.velocity[1, :3], -out.velocity[1, 2::-1], atol=1e-9)
@@ -216,7 +239,11 @@ def test_slow_plastic_limits(masses, k, exponent, u0):
 
 def test_compliant_values():
     """Touching, without losses and never opening twice it is LZB; with gaps it waits."""
-    same = [s for s in held_states() if not s.name.startswith("wall2_lin") and np.min(s.e) == 1]
+    same = [
+        s
+        for s in held_states()
+        if not s.name.startswith("wall2_lin") and np.min(s.e) == 1
+    ]
     assert len(same) > 20
     own = [
         chain(
@@ -256,7 +283,9 @@ def residual(e):
     v2 = -e * v2  # the wall
     v1, v2 = v1 - (1 + e) / 2 * (v1 - v2), v2 + (1 + e) / 2 * (v1 - v2)
     v2 = -e * v2  # the wall again, and then too slow for ball 1
-    return chain([1, 1], [1, 0], True, e=e, gaps=[0, 30], after=[v1, v2], name="residual")
+    return chain(
+        [1, 1], [1, 0], True, e=e, gaps=[0, 30], after=[v1, v2], name="residual"
+    )
 
 
 def reinsch():
@@ -395,10 +424,16 @@ def test_binary_order_by_gaps_and_ties():
             close([0, 0], "symmetric", "order_dependent"),
             # times are equal, speeds are not: the fastest goes first, and it is said
             chain(
-                [1, 1, 1], [1, 0, -2], gaps=[0.1, 0.2], after=[-2, 0, 1], status="order_dependent"
+                [1, 1, 1],
+                [1, 0, -2],
+                gaps=[0.1, 0.2],
+                after=[-2, 0, 1],
+                status="order_dependent",
             ),
             # open contacts collide in their turn
-            chain([1, 1, 1], [1, 0, 0], gaps=[0, 1e-3], after=[0, 0, 1], impulse=[1, 1]),
+            chain(
+                [1, 1, 1], [1, 0, 0], gaps=[0, 1e-3], after=[0, 0, 1], impulse=[1, 1]
+            ),
         ],
     )
     tied = close([2, 1], "symmetric", "order_dependent")  # 'fastest' knows no gaps
@@ -420,7 +455,9 @@ def test_binary_redundant_contacts():
     for e in ([0.5, 0.8], [0.9, 0.9]):
         last = 2 * (1 + e[1]) / (1 - e[0] * e[1])
         states.append(
-            chain([2], [1], "both", e=e, after=[0], status="plastic_limit", name=str(last))
+            chain(
+                [2], [1], "both", e=e, after=[0], status="plastic_limit", name=str(last)
+            )
         )
     twice = State(
         np.eye(2), [[-1, -1], [1, 1]], [1, 0], e=0.5, after=[0.25, 0.75],
@@ -428,7 +465,9 @@ def test_binary_redundant_contacts():
     )  # fmt: skip
     stays = chain([2], [1], "both", e=[0.3, 0.0], status="ok")
     out = check_held("binary", [*states, twice, stays])
-    np.testing.assert_allclose(out.impulse[:2, 1], [float(s.name) for s in states], rtol=1e-10)
+    np.testing.assert_allclose(
+        out.impulse[:2, 1], [float(s.name) for s in states], rtol=1e-10
+    )
 
 
 # ------------------------------------------------------------------------------ held slopes
@@ -482,7 +521,9 @@ def test_slopes_in_the_exponent_of_linear_springs():
         np.testing.assert_allclose(eta[:, :3, :2], slopes, atol=5e-8)
 
 
-@pytest.mark.parametrize("name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)]
+)
 def test_held_slopes(name):
     three = {"velocity": [1, 0, 0], "masses": [1, 1, 1]}
     states = [
@@ -495,13 +536,17 @@ def test_held_slopes(name):
         by_eta = eta[:, :3, :2].sum(axis=2)
         if name == "lzb":  # losses: where contacts open twice the compliant law differs
             np.testing.assert_allclose([by_k[0], *by_e[0].T], LINEAR, atol=1e-6)
-            np.testing.assert_allclose([by_eta[1], by_k[1], *by_e[1].T], HERTZ, atol=1e-6)
+            np.testing.assert_allclose(
+                [by_eta[1], by_k[1], *by_e[1].T], HERTZ, atol=1e-6
+            )
         np.testing.assert_allclose([by_k[2], by_eta[2]], ELASTIC, atol=1e-6)
 
 
 def test_slopes_at_the_edges_are_finite_and_one_sided():
     """e = 0.05 and 1; touching contacts; events that coincide; one-sided at e = 0."""
-    states = [chain([1, 1, 1], v, e=e) for e in (0.05, 1.0) for v in ([1, 0, 0], [1, 0.5, -1])]
+    states = [
+        chain([1, 1, 1], v, e=e) for e in (0.05, 1.0) for v in ([1, 0, 0], [1, 0.5, -1])
+    ]
     symmetric = chain([0.25, 1, 0.25], [1, 0, -1], e=0.8)
     at_zero = chain([3, 1, 2], [1, 0, -0.5], e=[0.95, 0.0], k=[1, 3])
     found = programs.derivatives("lzb")([*states, symmetric, at_zero])
@@ -509,7 +554,9 @@ def test_slopes_at_the_edges_are_finite_and_one_sided():
         for x in mode[:3]:
             assert np.isfinite(x).all()
     # the slope in e at 0 is one-sided: of second order from three values
-    near = [chain([3, 1, 2], [1, 0, -0.5], e=[0.95, e], k=[1, 3]) for e in (0.0, 2e-3, 4e-3)]
+    near = [
+        chain([3, 1, 2], [1, 0, -0.5], e=[0.95, e], k=[1, 3]) for e in (0.0, 2e-3, 4e-3)
+    ]
     moved = [chain([0.25, 1, 0.25], [1 + h, 0, -1], e=0.8) for h in (1e-3, -1e-3)]
     out, _ = programs.values("lzb")([*near, *moved])
     v = out.velocity[:, :3]

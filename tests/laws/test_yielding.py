@@ -66,7 +66,11 @@ def test_restitution_falls_with_the_speed(found):
     v_1 = SPEEDS * (1 - e) / 2
     np.testing.assert_allclose(v[:4, 0], v_1, atol=1e-7)
     np.testing.assert_allclose(
-        [float(ji.measured_restitution(ji.ElastoPlastic(1.0, 0.2), 0.5, x)) for x in SPEEDS], e
+        [
+            float(ji.measured_restitution(ji.ElastoPlastic(1.0, 0.2), 0.5, x))
+            for x in SPEEDS
+        ],
+        e,
     )
     assert (change[1:4] < -1e-3).all()
 
@@ -98,5 +102,7 @@ def test_the_loop_is_flat_at_the_yield_force():
     np.testing.assert_allclose(x[-1], residual, atol=1e-3)
     elastic = np.maximum(x[~rising] - residual, 0.0)
     np.testing.assert_allclose(f[~rising], elastic**1.5, atol=2e-3)
-    lost = 0.25 * (1 - float(ji.measured_restitution(ji.ElastoPlastic(1.0, 0.2), 0.5, 1.0)) ** 2)
+    lost = 0.25 * (
+        1 - float(ji.measured_restitution(ji.ElastoPlastic(1.0, 0.2), 0.5, 1.0)) ** 2
+    )
     assert 0.2 * residual == pytest.approx(lost, rel=1e-2)

@@ -75,7 +75,9 @@ def broken(make):
             outcome(*(np.concatenate(x) for x in zip(plain, scaled, backwards)))
         )
         after, faster, turned = np.split(out.velocity, 3)
-        found, status = jax.tree.map(operator.itemgetter(slice(len(v))), (found, out.status))
+        found, status = jax.tree.map(
+            operator.itemgetter(slice(len(v))), (found, out.status)
+        )
         same = _SAME * np.abs(v).max(axis=1)
         bad = [
             ~found.momentum,
@@ -84,7 +86,10 @@ def broken(make):
             ~found.energetic,
             np.abs(faster / 1e3 - after).max(axis=1) > same,
             np.abs(turned - after).max(axis=1) > same,
-            np.isin(status, [ji.STATUS.index(row) for row in ji.STATUS if row.name in UNFINISHED]),
+            np.isin(
+                status,
+                [ji.STATUS.index(row) for row in ji.STATUS if row.name in UNFINISHED],
+            ),
         ]
         counts += np.sum(bad, axis=1)
         failure = np.array([row.failure for row in ji.STATUS])

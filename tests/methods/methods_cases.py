@@ -14,4 +14,6 @@ SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
 def rod(angle):
     """A rod that falls on its lower end in the plane."""
     across, up = -0.5 * np.cos(angle), 0.5 * np.sin(angle)
-    return ji.Scene([1, 1, 1 / 12], [[0.0], [1.0], [across]], tangents=[[1.0], [0.0], [up]])
+    return ji.Scene(
+        [1, 1, 1 / 12], [[0.0], [1.0], [across]], tangents=[[1.0], [0.0], [up]]
+    )

@@ -38,7 +38,15 @@ def chart():
     ladder = {name: list(map(float, row[0])) for name, row in ORDERS.items()}
     laws = {"binary": ji.Binary(0.9)}
     return ji.work_precision(
-        HERTZ, BALLS, STRIKE, list(ladder), ladder, laws, batch=8, repeats=2, gradients=False
+        HERTZ,
+        BALLS,
+        STRIKE,
+        list(ladder),
+        ladder,
+        laws,
+        batch=8,
+        repeats=2,
+        gradients=False,
     )
 
 
@@ -79,9 +87,13 @@ def test_chart_in_words_and_picture(chart):
 def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
     others = ("verlet", "tsit5", "scipy_lsoda")  # and one of each kind
-    result = ji.work_precision(linear, BALLS, STRIKE, others, laws={}, batch=8, repeats=1)
+    result = ji.work_precision(
+        linear, BALLS, STRIKE, others, laws={}, batch=8, repeats=1
+    )
     assert not result.left_out
-    assert result.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
+    assert (
+        result.reference.uncertainty["velocity"] < 1e-11
+    )  # two independent integrators
     for name, row in result.points.items():
         assert all(point.evaluations > 0 for point in row), name
     assert 1e-9 < result.points["verlet"][-1].error["gradient"] < 0.1
@@ -96,7 +108,11 @@ def test_gradients_and_the_other_methods():
 def on_the_ground(name):
     """A box of the tables, its v- and a law."""
     mass, normals, tangents, velocity = NAMED[name]()
-    return ji.Scene(mass, normals, tangents=tangents), velocity, ji.LZB(0.3, friction=0.3)
+    return (
+        ji.Scene(mass, normals, tangents=tangents),
+        velocity,
+        ji.LZB(0.3, friction=0.3),
+    )
 
 
 @pytest.mark.release
@@ -133,18 +149,34 @@ def test_chart_of_a_box_on_a_corner():
             "it has no friction",
         ),
         ({"velocity": [1.0, 0.0]}, ValueError, "`velocity` must have shape (3,)"),
-        ({"velocity": [0.0, 0.0, 1.0]}, ValueError, "`velocity` must let a closed contact"),
+        (
+            {"velocity": [0.0, 0.0, 1.0]},
+            ValueError,
+            "`velocity` must let a closed contact",
+        ),
         ({"velocity": [1.0, np.nan, 0.0]}, ValueError, "`velocity` must be finite"),
         ({"law": ji.Newton(0.5)}, TypeError, "`law` must be an LZB law, but is Newton"),
-        ({"law": ji.LZB([1, 1, 1.0])}, ValueError, "`restitution` must have shape (2,)"),
+        (
+            {"law": ji.LZB([1, 1, 1.0])},
+            ValueError,
+            "`restitution` must have shape (2,)",
+        ),
         ({"methods": ["magic"]}, ValueError, "`methods` must be one of"),
         ({"methods": "verlet"}, TypeError, "`methods` must be a list"),
         ({"methods": ["rk4", "rk4"]}, ValueError, "one contender or more, each once"),
         ({"methods": []}, ValueError, "one contender or more, each once"),
         ({"law": ji.LZB(0.0), "methods": ["rk4"]}, ValueError, "it divides by e^2"),
         ({"settings": {"rk4": [0.1]}}, ValueError, "`settings` must be one of verlet"),
-        ({"settings": {"verlet": [0.0]}}, ValueError, "`settings['verlet']` must lie in (0"),
-        ({"settings": {"verlet": []}}, ValueError, "`settings['verlet']` must be a scalar or"),
+        (
+            {"settings": {"verlet": [0.0]}},
+            ValueError,
+            "`settings['verlet']` must lie in (0",
+        ),
+        (
+            {"settings": {"verlet": []}},
+            ValueError,
+            "`settings['verlet']` must be a scalar or",
+        ),
         ({"settings": ["verlet"]}, TypeError, "`settings` must be of type Mapping"),
         ({"laws": [ji.Newton(0.5)]}, TypeError, "`laws` must be of type Mapping"),
         ({"laws": {"verlet": ji.Newton(0.5)}}, ValueError, "names that no method has"),
@@ -154,7 +186,12 @@ def test_chart_of_a_box_on_a_corner():
     ],
 )
 def test_chart_refuses(change, error, message):
-    arguments = {"scene": BALLS, "velocity": STRIKE, "law": HERTZ, "methods": ["verlet"]}
+    arguments = {
+        "scene": BALLS,
+        "velocity": STRIKE,
+        "law": HERTZ,
+        "methods": ["verlet"],
+    }
     with pytest.raises(error) as raised:
         ji.work_precision(**(arguments | change))
     assert message in str(raised.value)
@@ -197,7 +234,12 @@ def hypercube(n, steps):
         return out, ji.audit(out, scene, v).consistent
 
     out, consistent = jax.tree.map(np.asarray, run(mass, k, e, eta))
-    return at, out, consistent, np.abs(out.velocity - HELD["velocity"][at, :n]).max(axis=1)
+    return (
+        at,
+        out,
+        consistent,
+        np.abs(out.velocity - HELD["velocity"][at, :n]).max(axis=1),
+    )
 
 
 def check_hypercube(n, steps):
@@ -256,7 +298,10 @@ def test_hard_points_after_many_steps(point):
 def test_points_are_those_of_the_script():
     assert len(HELD["points"]) == 300
     np.testing.assert_allclose(HELD["points"], stability_reference.points(), rtol=1e-12)
-    assert HELD["uncertainty"][np.isfinite(HELD["uncertainty"])].max() < 0.1 * HONEST * RTOL
+    assert (
+        HELD["uncertainty"][np.isfinite(HELD["uncertainty"])].max()
+        < 0.1 * HONEST * RTOL
+    )
 
 
 # 10 and 30 equal Hertz balls by the oracle of tests/benchmarks/lzb_oracle.cpp
@@ -279,7 +324,9 @@ def test_long_chains():
     """Right where Siconos ends with 981 times the energy; long chains re-close below e = 0.5."""
 
     def after(n):
-        run = jax.vmap(lambda e: ji.impact(ji.LZB(e), ji.chain(jnp.ones(n)), jnp.eye(n)[0]))
+        run = jax.vmap(
+            lambda e: ji.impact(ji.LZB(e), ji.chain(jnp.ones(n)), jnp.eye(n)[0])
+        )
         return jax.jit(run)
 
     out = after(10)(jnp.array([1.0, 0.9, 0.5, 0.4]))
@@ -293,7 +340,9 @@ def test_long_chains():
     assert names(out.status) == ["ok", "ok"]
     for v, held in zip(np.asarray(out.velocity), THIRTY.values()):
         ends = v[[0, 1, 2, -3, -2, -1]]
-        np.testing.assert_allclose(ends, np.array(held.split(), float), rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            ends, np.array(held.split(), float), rtol=0, atol=1e-7
+        )
     out = after(100)(jnp.array([1.0]))
     assert names(out.status) == ["ok"]
     assert abs(float(out.energy_change[0])) < 1e-7
@@ -303,7 +352,9 @@ def test_long_chains():
 @pytest.mark.release
 def test_stability_map():
     axes = {"setting": [0.0, 0.6], "exponent": [1.5, 3.0], "restitution": [0.0, 0.9]}
-    result = ji.stability_map(("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000)
+    result = ji.stability_map(
+        ("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000
+    )
     assert result.methods == ("rk4", "verlet")
     for name in result.methods:
         setting, exponent = result.slices[name][:2]
@@ -311,7 +362,10 @@ def test_stability_map():
         assert (exponent.codes == 0).all()
         assert sum(result.counts(name).values()) == 6 + 3 * 4 + 3
     assert result.confirmation.tried == result.confirmation.confirmed > 0
-    assert json.loads(json.dumps(result.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
+    assert (
+        json.loads(json.dumps(result.to_dict()))["methods"]["rk4"]["counts"]["right"]
+        > 3
+    )
     assert ji.plot.stability_map(result, "title").axes
 
 
@@ -321,7 +375,12 @@ def test_stability_map_of_a_scene_with_friction():
     axes = {"setting": [0.35, 0.8], "friction": [0.05, 2.0]}
     base = {"exponent": 1.5, "restitution": 0.6, "friction": 2.0, "setting": 0.6}
     result = ji.stability_map(
-        ["time", "verlet"], axes, base, scene=rod(1.2), velocity=[0.5, -1, 0], max_steps=2000
+        ["time", "verlet"],
+        axes,
+        base,
+        scene=rod(1.2),
+        velocity=[0.5, -1, 0],
+        max_steps=2000,
     )
     assert result.counts("time")["right"] == 4
     setting, friction = result.slices["verlet"]
@@ -402,7 +461,12 @@ def test_unknown_ratio_decides(unknown):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "tolerance", "name"),
-    [(1e3, 0.02, "newton"), (50.0, 0.02, "lzb"), (1.0, 0.02, "lzb"), (0.01, 0.02, "binary")],
+    [
+        (1e3, 0.02, "newton"),
+        (50.0, 0.02, "lzb"),
+        (1.0, 0.02, "lzb"),
+        (0.01, 0.02, "binary"),
+    ],
 )
 def test_known_ratio(ratio, tolerance, name):
     result = quick(BALLS, STRIKE, tolerance, stiffness=[1.0, ratio])
@@ -438,7 +502,9 @@ def test_special_scenes():
     assert "plastic contacts" in result.reason
     result = quick(BALLS, [-1.0, 0.0, 2.0])
     assert result.reason.startswith("no approach: nothing happens")
-    both = quick(ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0], 0.9, stiffness=[1.0, 1.0])
+    both = quick(
+        ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0], 0.9, stiffness=[1.0, 1.0]
+    )
     assert both.candidates["binary"].status == "order_dependent"
     assert not both.candidates["binary"].usable
     assert both.name == "newton"
@@ -452,7 +518,9 @@ def test_special_scenes():
 def test_gaps(gap, tolerance, name):
     scene = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, gap])
     result = quick(scene, STRIKE, tolerance, stiffness=1.2e8)
-    exact = ji.impact(ji.Compliant(ji.Bistiffness(1.2e8, 1.5, 1.0)), scene, STRIKE).velocity
+    exact = ji.impact(
+        ji.Compliant(ji.Bistiffness(1.2e8, 1.5, 1.0)), scene, STRIKE
+    ).velocity
     assert (result.name, result.within) == (name, True)
     got = np.asarray(ji.impact(result.law, result.scene, STRIKE).velocity)
     assert np.abs(got - exact).max() <= tolerance
@@ -472,7 +540,9 @@ def test_friction_is_part_of_every_law():
         atol=1e-6,
     )
     assert "Moreau(0.1, friction=0.5), within 1 %" in str(advice)
-    assert "contacts 3, 4 too far open to close during the impact" in str(advice).replace("\n", " ")
+    assert "contacts 3, 4 too far open to close during the impact" in str(
+        advice
+    ).replace("\n", " ")
 
 
 @pytest.mark.release
@@ -480,10 +550,15 @@ def test_contacts_that_close_again():
     """Two balls at a wall: LZB re-closes at once, Compliant waits for its gap and is right."""
     options = {"exponent": 1.0, "stiffness": 1.0, "tolerance": 5e-3}
     advice = quick(ji.chain([1.0, 1.0], wall=True), [1.0, 0.0], **options)
-    at_once = [-0.97547042321005322912, -0.22013053727822418238]  # integrated piece by piece
+    at_once = [
+        -0.97547042321005322912,
+        -0.22013053727822418238,
+    ]  # integrated piece by piece
     waiting = [-0.976928618648904904, -0.213566088283562787]
     np.testing.assert_allclose(advice.candidates["lzb"].velocity, at_once, atol=1e-7)
-    np.testing.assert_allclose(advice.candidates["compliant"].velocity, waiting, atol=1e-7)
+    np.testing.assert_allclose(
+        advice.candidates["compliant"].velocity, waiting, atol=1e-7
+    )
     apart = np.linalg.norm(np.subtract(at_once, waiting))  # equal masses, |v-| = 1
     assert advice.reclosing == pytest.approx(apart, rel=1e-4)
     assert (advice.name, advice.reference) == ("compliant", "compliant")
@@ -541,7 +616,9 @@ def test_contacts_that_an_impact_needs():
 @pytest.mark.slow
 def test_one_of_two_contacts_at_the_same_place_is_left_out():
     """Two balls fall, each on two contacts that act alike: any two of one ball are too many."""
-    scene = ji.Scene(jnp.ones(2), jnp.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]]))
+    scene = ji.Scene(
+        jnp.ones(2), jnp.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
+    )
     advice = ji.simplest_scene(ji.Moreau(0.5), scene, [-1.0, -1.0])
     np.testing.assert_allclose(advice.errors, 0, atol=1e-12)
     assert [contact // 2 for contact in advice.kept] == [0, 1]
@@ -556,7 +633,9 @@ def test_friction_that_an_impact_needs():
     assert advice.friction["one direction"] == pytest.approx(0, abs=1e-9)
     # v- has m (s^2 + 1) / 2, and the impulse 2 m s / 7 does half the work 2/7 m s^2
     assert advice.friction["none"] == pytest.approx(np.sqrt(2 / 7 / 2))
-    np.testing.assert_allclose(np.abs(advice.scene.tangents[:5, 0]), [0.6, 0.8, 0, 0.08, 0.06])
+    np.testing.assert_allclose(
+        np.abs(advice.scene.tangents[:5, 0]), [0.6, 0.8, 0, 0.08, 0.06]
+    )
 
 
 @pytest.mark.parametrize(
@@ -570,7 +649,9 @@ def test_friction_that_an_impact_needs():
 )
 def test_simplest_scene_refuses(options, message):
     with pytest.raises(ValueError, match=message):
-        ji.simplest_scene(**({"law": EachAlone(), "scene": BALLS, "velocity": STRIKE} | options))
+        ji.simplest_scene(
+            **({"law": EachAlone(), "scene": BALLS, "velocity": STRIKE} | options)
+        )
 
 
 @pytest.mark.release
@@ -587,14 +668,22 @@ def test_several_ratios():
     [
         ({"tolerance": 0.0}, ValueError, "`tolerance` must lie in"),
         ({"tolerance": [0.1]}, ValueError, "`tolerance` must have shape"),
-        ({"stiffness_range": (2.0, 1.0)}, ValueError, "`stiffness_range` must have low <= high"),
+        (
+            {"stiffness_range": (2.0, 1.0)},
+            ValueError,
+            "`stiffness_range` must have low <= high",
+        ),
         ({"stiffness_range": (0.0, 1.0)}, ValueError, "`stiffness_range` must lie in"),
         ({"samples": 0}, ValueError, "`samples` must be an int >= 1"),
         ({"seed": -1}, ValueError, "`seed` must be an int >= 0"),
         ({"restitution": 1.5}, ValueError, "`restitution` must lie in"),
         ({"stiffness": [1.0, 2.0, 3.0]}, ValueError, "`stiffness` must be a scalar or"),
         ({"exponent": 0.5}, ValueError, "`exponent` must lie in"),
-        ({"exponent": (1.0, 1.5)}, ValueError, "`stiffness` must be given where exponents differ"),
+        (
+            {"exponent": (1.0, 1.5)},
+            ValueError,
+            "`stiffness` must be given where exponents differ",
+        ),
         (
             {"scene": ji.chain([1.0] * 3, gaps=[0.0, 2e-3])},
             ValueError,
@@ -649,7 +738,9 @@ def test_validity_map(valid):
     assert valid.law_dispersion["moreau"] == pytest.approx(2 / 3)
     assert valid.law_dispersion["binary"] == pytest.approx(0.0)
     binary = valid.error("binary")
-    np.testing.assert_allclose(binary[:, 0] / binary[:, 1], 1e-3, rtol=0.01)  # first order in k2/k1
+    np.testing.assert_allclose(
+        binary[:, 0] / binary[:, 1], 1e-3, rtol=0.01
+    )  # first order in k2/k1
     assert (np.diff(binary[:, 1]) < 0).all()
     moreau = valid.error("moreau")[:, -2:]
     assert (moreau[:, 1] < moreau[:, 0]).all()
@@ -701,12 +792,20 @@ def test_compare_gives_every_law_its_outcome():
 
 
 def test_dispersion_index_and_energy_ratio():
-    for v, index in (([0, 0, 1.0], 0.0), ([-1 / 3, 2 / 3, 2 / 3], 2 / 3), ([1, -1, 1.0], 1.0)):
-        assert float(ji.theory.dispersion_index(BALLS, v)) == pytest.approx(index, abs=1e-14)
+    for v, index in (
+        ([0, 0, 1.0], 0.0),
+        ([-1 / 3, 2 / 3, 2 / 3], 2 / 3),
+        ([1, -1, 1.0], 1.0),
+    ):
+        assert float(ji.theory.dispersion_index(BALLS, v)) == pytest.approx(
+            index, abs=1e-14
+        )
     heavy = ji.chain([4.0, 1.0])
     assert float(ji.theory.energy_dispersion(heavy, [1.0, 0.0])) == pytest.approx(1.0)
     assert float(ji.theory.dispersion_index(heavy, [1.0, -2.0])) == pytest.approx(1.0)
-    assert float(ji.theory.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])) == pytest.approx(0.25)
+    assert float(
+        ji.theory.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])
+    ) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(
@@ -716,16 +815,28 @@ def test_dispersion_index_and_energy_ratio():
         ((-1 / 3, 2 / 3, 2 / 3), 1.0, 0.47140),  # B
         ((0.0, 0.5, 0.5), 0.5, 0.70711),  # Moreau, e = 1/2
         ((0.203125, 0.234375, 0.5625), 0.41260, 0.92055),  # binary, e = 1/2
-        ((-0.130261695064521, 0.150229569434774, 0.980032125629747), 1.0, 1.33036),  # LZB, eta 1
-        ((-0.070952353651437, 0.076403039071207, 0.994549314580230), 1.0, 1.39115),  # 1.5
+        (
+            (-0.130261695064521, 0.150229569434774, 0.980032125629747),
+            1.0,
+            1.33036,
+        ),  # LZB, eta 1
+        (
+            (-0.070952353651437, 0.076403039071207, 0.994549314580230),
+            1.0,
+            1.39115,
+        ),  # 1.5
         ((-0.037880398123056, 0.039374137379719, 0.998506260743337), 1.0, 1.40788),  # 2
         ((-0.010396841805953, 0.010506083831368, 0.999890757974585), 1.0, 1.41375),  # 3
     ],
 )
 def test_energy_kept_and_its_dispersion(after, kept, spread):
     """Of three equal balls, k2/k1 = 1; outcomes are closed forms, or held in test_values."""
-    assert float(ji.theory.energy_ratio(BALLS, STRIKE, after)) == pytest.approx(kept, abs=6e-6)
-    assert float(ji.theory.energy_dispersion(BALLS, after)) == pytest.approx(spread, abs=6e-6)
+    assert float(ji.theory.energy_ratio(BALLS, STRIKE, after)) == pytest.approx(
+        kept, abs=6e-6
+    )
+    assert float(ji.theory.energy_dispersion(BALLS, after)) == pytest.approx(
+        spread, abs=6e-6
+    )
 
 
 def test_dispersion_falls_along_the_arc():
@@ -733,7 +844,9 @@ def test_dispersion_falls_along_the_arc():
     arc = ji.theory.admissible_set(BALLS, STRIKE).conserving_arc(13)
     spread = [float(ji.theory.energy_dispersion(BALLS, v)) for v in arc]
     assert (np.diff(spread) < 0).all()
-    np.testing.assert_allclose([spread[0], spread[-1]], [2**0.5, 2**0.5 / 3], rtol=1e-12)
+    np.testing.assert_allclose(
+        [spread[0], spread[-1]], [2**0.5, 2**0.5 / 3], rtol=1e-12
+    )
 
 
 @pytest.mark.long_run

@@ -23,7 +23,9 @@ def test_verlet_with_friction():
     @jax.vmap
     def run(mu, step):
         law = ji.LZB(0.6, friction=mu)
-        return outcome(law, DISC, SLIDES, CONTENDERS["verlet"].solve(law, DISC, SLIDES, step))
+        return outcome(
+            law, DISC, SLIDES, CONTENDERS["verlet"].solve(law, DISC, SLIDES, step)
+        )
 
     steps, mu = np.array([0.03, 0.003]), np.array([0.1, 2.0])
     out = run(np.repeat(mu, 2), np.tile(steps, 2))
@@ -40,7 +42,9 @@ def test_verlet_with_friction():
 def test_scipy_with_friction(angle):
     """A rod in Routh's closed form; between slip and stick friction is regularized."""
     v = [0.5, -1.0, 0.0]
-    result = CONTENDERS["scipy_radau"].solve(ji.LZB(0.5, friction=0.3), rod(angle), v, 1e-6)
+    result = CONTENDERS["scipy_radau"].solve(
+        ji.LZB(0.5, friction=0.3), rod(angle), v, 1e-6
+    )
     normal, side = routh(rod(angle), v, 0.3, 0.5)
     np.testing.assert_allclose(result.impulse, [normal], atol=1e-5)
     np.testing.assert_allclose(result.tangential, [side], atol=1e-5)
@@ -79,7 +83,13 @@ def test_honest_tolerance_over_random_scenes(rtol):
     """99 % within 10 rtol; the worst within 100 rtol or flagged."""
     errors = []
     for seed, (bodies, wall, exponent) in enumerate(
-        [(2, True, 1.0), (3, False, 1.3), (4, True, 1.5), (5, False, 2.0), (6, True, 1.5)]
+        [
+            (2, True, 1.0),
+            (3, False, 1.3),
+            (4, True, 1.5),
+            (5, False, 2.0),
+            (6, True, 1.5),
+        ]
     ):
         if rtol != 1e-8 and bodies not in (3, 4):
             continue
@@ -98,7 +108,9 @@ def test_honest_tolerance_over_random_scenes(rtol):
         assert flagged.mean() < 0.1
         errors += list((error / np.abs(args[3]).max(axis=1) / rtol)[~flagged])
     quantiles = np.quantile(errors, [0.5, 0.9, 0.99, 1.0])
-    print(f"error/rtol over {len(errors)} scenes at {rtol:g}: 50/90/99/100 % {quantiles}")
+    print(
+        f"error/rtol over {len(errors)} scenes at {rtol:g}: 50/90/99/100 % {quantiles}"
+    )
     assert quantiles[2] < 10
     assert quantiles[3] < 100
 
@@ -107,7 +119,9 @@ def test_distance_is_a_ratio_of_energy_norms():
     """sqrt(dv^T M dv) / sqrt(v-^T M v-): no unit of an angle enters."""
     metres = EnergyNorm.of(ji.Scene([4.0, 1.0], np.eye(2)), np.array([1.0, 0.0]))
     assert metres(np.array([0.1, 0.2])) == pytest.approx(math.sqrt(0.04 + 0.04) / 2)
-    degrees = ji.Scene([4.0, 0.01], np.diag([1.0, 0.1]))  # the second coordinate ten times larger
+    degrees = ji.Scene(
+        [4.0, 0.01], np.diag([1.0, 0.1])
+    )  # the second coordinate ten times larger
     scaled = EnergyNorm.of(degrees, np.array([1.0, 0.0]))
     assert scaled(np.array([0.1, 2.0])) == pytest.approx(math.sqrt(0.08) / 2)
 
@@ -115,14 +129,20 @@ def test_distance_is_a_ratio_of_energy_norms():
 def test_far_contacts_take_no_part():
     """The upper corners of a block on its base; the gaps of a chain always count."""
     block = ji.Block(0.2, 0.6, 2.0)
-    scene, v, law = block.scene(block.touching()), np.array([0.3, -0.1, -1.0]), ji.LZB(0.1, 1e8)
+    scene, v, law = (
+        block.scene(block.touching()),
+        np.array([0.3, -0.1, -1.0]),
+        ji.LZB(0.1, 1e8),
+    )
     for known in (False, True):
         at = situation_of(scene, v, law, known)
         assert at.far.tolist() == [False, False, True, True]
         assert [b.contacts for b in at.blocks] == [(0, 1)]
         assert not at.gapped.any()
         assert np.isinf(at.touching.gaps[2:]).all()
-    tilted = situation_of(block.scene(block.touching(1e-5)), v, law, True)  # 2 micrometres
+    tilted = situation_of(
+        block.scene(block.touching(1e-5)), v, law, True
+    )  # 2 micrometres
     assert tilted.far.tolist() == [False, False, True, True]
     assert tilted.gapped.tolist() == [True, False, False, False]
     chain = ji.chain([1.0] * 3, gaps=[0.0, 5.0])
@@ -153,7 +173,9 @@ def test_limits_are_of_the_unbroken_run_from_their_end():
 
 def test_a_contender_of_ones_own_has_a_name_of_its_own():
     mine = CONTENDERS["rk4"]._replace(divides=False)
-    with pytest.raises(ValueError, match=r"`methods` must have contenders of new names.*'rk4'"):
+    with pytest.raises(
+        ValueError, match=r"`methods` must have contenders of new names.*'rk4'"
+    ):
         ji.stability_map([mine])
 
 

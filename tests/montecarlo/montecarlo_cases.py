@@ -18,7 +18,9 @@ CHUNK = 256  # one compiled program for most of this file
 
 
 def sampled(samples=1000, law=LAW, velocity=BEFORE, gaps=GAPS, **options):
-    return monte_carlo(law, BALLS, velocity, gaps, samples, **({"chunk": CHUNK} | options))
+    return monte_carlo(
+        law, BALLS, velocity, gaps, samples, **({"chunk": CHUNK} | options)
+    )
 
 
 def sometimes_bad(key):

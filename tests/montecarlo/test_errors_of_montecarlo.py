@@ -14,11 +14,16 @@ def samples(**options):
     """A Monte Carlo run of few samples."""
     given = {"law": ji.Binary(0.9, "earliest"), "scene": BALLS, "velocity": V}
     gaps = ji.Uniform(0.0, 1e-5)
-    return ji.monte_carlo(**(given | {"gaps": gaps, "samples": 4, "progress": False} | options))
+    return ji.monte_carlo(
+        **(given | {"gaps": gaps, "samples": 4, "progress": False} | options)
+    )
 
 
 REFUSED = [
-    (lambda: samples(velocity=lambda key: [1.0, 0.0, 0.0]), "`velocity` must give an array"),
+    (
+        lambda: samples(velocity=lambda key: [1.0, 0.0, 0.0]),
+        "`velocity` must give an array",
+    ),
     (lambda: samples(law=ji.Binary), "`law` must be a Law or a function"),
     (lambda: samples(key=2**70), "`key` must have at most 64 bits"),
     (lambda: samples(folder=3), "`folder` must be a path, but is 3"),

@@ -26,13 +26,28 @@ def drawn_law():
 def run(executor, samples=1000, **options):
     gaps = Uniform(0.0, 1e-5)
     return monte_carlo(
-        drawn_law(), BALLS, [1.0, 0.0, -1.0], gaps, samples, chunk=128, executor=executor, **options
+        drawn_law(),
+        BALLS,
+        [1.0, 0.0, -1.0],
+        gaps,
+        samples,
+        chunk=128,
+        executor=executor,
+        **options,
     )
 
 
 def same(a, b):
     """Whether two results have the same bits."""
-    names = ["mean", "covariance", "gap_covariance", "counts", "edges", "minimum", "maximum"]
+    names = [
+        "mean",
+        "covariance",
+        "gap_covariance",
+        "counts",
+        "edges",
+        "minimum",
+        "maximum",
+    ]
     parts = [(getattr(a, name), getattr(b, name)) for name in names]
     parts += [(a.first[name], b.first[name]) for name in a.first]
     return a.statuses == b.statuses and all(np.array_equal(*pair) for pair in parts)
@@ -55,7 +70,9 @@ def test_threads_change_no_bit(wanted, workers):
     assert same(run("threads", workers=workers), wanted)
 
 
-def test_what_was_finished_before_an_error_in_a_thread_is_kept(wanted, tmp_path, monkeypatch):
+def test_what_was_finished_before_an_error_in_a_thread_is_kept(
+    wanted, tmp_path, monkeypatch
+):
     """The third chunk fails; the same call continues from the two before it."""
     import numpy
 
@@ -92,7 +109,9 @@ def test_errors_of_a_chunk_come_through():
 
 @pytest.mark.parametrize("workers", [0, -1, 1.5, True, "all"])
 def test_numbers_of_workers_that_are_none(workers):
-    with pytest.raises(ValueError, match="`workers` must be an int >= 1, but has value"):
+    with pytest.raises(
+        ValueError, match="`workers` must be an int >= 1, but has value"
+    ):
         run("threads", workers=workers)
 
 
@@ -107,7 +126,9 @@ def test_an_error_in_a_thread_comes_through(tmp_path):
         return np.float64(0.9)
 
     def law(key):
-        return Binary(jax.pure_callback(value, jax.ShapeDtypeStruct((), float)), "earliest")
+        return Binary(
+            jax.pure_callback(value, jax.ShapeDtypeStruct((), float)), "earliest"
+        )
 
     with pytest.raises(Exception, match="this law cannot be drawn"):
         monte_carlo(
@@ -129,8 +150,16 @@ run("threads", 1_000_000, workers=2, folder=sys.argv[2])
 
 @pytest.mark.slow
 def test_ctrl_c_ends_threads_soon_and_keeps_their_chunks(tmp_path, wanted):
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
-    command = [sys.executable, "-c", UNTIL_INTERRUPTED, os.path.dirname(__file__), str(tmp_path)]
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # an ignored one would be inherited
+    command = [
+        sys.executable,
+        "-c",
+        UNTIL_INTERRUPTED,
+        os.path.dirname(__file__),
+        str(tmp_path),
+    ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         while len(list(tmp_path.glob("chunk-*.npz"))) < 8:
@@ -246,7 +275,11 @@ SHARDED = {
     "compliant": (lambda e: ji.Compliant(ji.KelvinVoigt(1e4, e)), BALLS, V_BALLS),
     "friction-moreau": (lambda e: ji.Moreau(e, friction=0.4), IN_SPACE, V_SPACE),
     "friction-binary": (lambda e: Binary(e, friction=0.4), IN_PLANE, V_PLANE),
-    "friction-lzb": (lambda e: ji.LZB(e, friction=0.4, method="time"), IN_PLANE, V_PLANE),
+    "friction-lzb": (
+        lambda e: ji.LZB(e, friction=0.4, method="time"),
+        IN_PLANE,
+        V_PLANE,
+    ),
     "friction-implicit": (
         lambda e: ji.LZB(e, friction=0.4, method="implicit"),
         IN_SPACE,
@@ -271,14 +304,19 @@ def on_a_mesh(function, batch=(None, 0)):
 
     The law is on all of them, or with `batch` (0, 0) shared out as well.
     """
-    mesh, axis = jax.sharding.Mesh(np.array(jax.devices()), ("shot",)), jax.sharding.PartitionSpec
+    mesh, axis = (
+        jax.sharding.Mesh(np.array(jax.devices()), ("shot",)),
+        jax.sharding.PartitionSpec,
+    )
     specs = tuple(axis() if first is None else axis("shot") for first in batch)
 
     def part(parameter, velocities):
         here = jax.vmap(function, batch)(parameter, velocities)
         return here, jax.tree.map(lambda x: jax.lax.psum(x.sum(axis=0), "shot"), here)
 
-    return jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=(axis("shot"), axis()))
+    return jax.shard_map(
+        part, mesh=mesh, in_specs=specs, out_specs=(axis("shot"), axis())
+    )
 
 
 @pytest.mark.release
@@ -325,7 +363,9 @@ for name in sys.argv[2:] or SHARDED:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(x, marks=pytest.mark.slow if x == "moreau" else pytest.mark.release)
+        pytest.param(
+            x, marks=pytest.mark.slow if x == "moreau" else pytest.mark.release
+        )
         for x in SHARDED
     ],
 )
@@ -333,7 +373,13 @@ def test_shard_map_on_four_devices(name):
     """Values and derivatives in both modes are those of one device."""
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     done = subprocess.run(
-        [sys.executable, "-c", ON_FOUR_DEVICES_SHARDED, os.path.dirname(__file__), name],
+        [
+            sys.executable,
+            "-c",
+            ON_FOUR_DEVICES_SHARDED,
+            os.path.dirname(__file__),
+            name,
+        ],
         env=os.environ | flags,
         capture_output=True,
         text=True,

@@ -26,7 +26,10 @@ from jimpact import (
 )
 from jimpact.theory import gap_sensitivity
 
-LEFT, RIGHT = np.array([-0.6, -0.16, 1.24]), np.array([-1.24, 0.16, 0.6])  # which contact is first
+LEFT, RIGHT = (
+    np.array([-0.6, -0.16, 1.24]),
+    np.array([-1.24, 0.16, 0.6]),
+)  # which contact is first
 
 
 def test_statistics_are_those_of_the_raw_samples(tmp_path):
@@ -34,7 +37,9 @@ def test_statistics_are_those_of_the_raw_samples(tmp_path):
     result = sampled(law=law, folder=tmp_path, keep_samples=True)
     parts = list(read_samples(tmp_path))
     assert [len(part["status"]) for part in parts] == [256, 256, 256, 232]
-    v, gaps = (np.concatenate([part[name] for part in parts]) for name in ("velocity", "gaps"))
+    v, gaps = (
+        np.concatenate([part[name] for part in parts]) for name in ("velocity", "gaps")
+    )
     both = np.concatenate([v, gaps], axis=1)
     covariance = np.cov(both.T)
     np.testing.assert_allclose(result.mean, v.mean(axis=0), rtol=1e-13, atol=1e-15)
@@ -48,7 +53,9 @@ def test_statistics_are_those_of_the_raw_samples(tmp_path):
     for q in (0.0, 0.05, 0.31, 0.95, 1.0):
         wanted = np.quantile(v, q, axis=0, method="inverted_cdf")
         assert np.all(np.abs(result.quantile(q) - wanted) <= result.quantile_resolution)
-    np.testing.assert_allclose(result.standard_error, v.std(axis=0, ddof=1) / np.sqrt(1000))
+    np.testing.assert_allclose(
+        result.standard_error, v.std(axis=0, ddof=1) / np.sqrt(1000)
+    )
     np.testing.assert_array_equal(result.first["velocity"], parts[0]["velocity"])
 
 
@@ -63,8 +70,12 @@ def test_each_sample_is_the_impact_of_its_gaps():
     assert np.asarray(scene.gaps).tobytes() == gaps[7].tobytes()
     np.testing.assert_allclose(impact(law, scene, velocity).velocity, v[7], atol=1e-14)
     last = result.replay(299)[1].gaps
-    assert not np.array_equal(np.asarray(last), gaps[299 - 256])  # another chunk, other draws
-    with pytest.raises(ValueError, match=r"`index` must lie in \[0, 299\], but has value 300"):
+    assert not np.array_equal(
+        np.asarray(last), gaps[299 - 256]
+    )  # another chunk, other draws
+    with pytest.raises(
+        ValueError, match=r"`index` must lie in \[0, 299\], but has value 300"
+    ):
         result.replay(300)
 
 
@@ -83,12 +94,20 @@ def test_random_parameters_velocities_and_their_analytic_moments():
     np.testing.assert_allclose(result.std[1], 0.2 / np.sqrt(12), rtol=0.03)
     np.testing.assert_allclose(result.quantile(0.25)[1], 0.85, atol=0.01)
     assert result.gap_mean.shape == (0,)
-    moving = monte_carlo(Newton(0.5), balls, Normal([2.0, 0.0], 0.1), samples=4000, chunk=1000)
+    moving = monte_carlo(
+        Newton(0.5), balls, Normal([2.0, 0.0], 0.1), samples=4000, chunk=1000
+    )
     a = np.array([[0.25, 0.75], [0.75, 0.25]])  # v+ = A v-, all of them approach
-    np.testing.assert_allclose(moving.mean, a @ [2.0, 0.0], atol=4 * 0.1 / np.sqrt(4000))
+    np.testing.assert_allclose(
+        moving.mean, a @ [2.0, 0.0], atol=4 * 0.1 / np.sqrt(4000)
+    )
     np.testing.assert_allclose(moving.covariance, 0.01 * a @ a.T, rtol=0.1)
     result = monte_carlo(
-        lambda key: Newton(jax.random.uniform(key)), balls, [1.0, 0.0], samples=10, chunk=16
+        lambda key: Newton(jax.random.uniform(key)),
+        balls,
+        [1.0, 0.0],
+        samples=10,
+        chunk=16,
     )
     e = np.array([float(result.replay(i)[0].restitution) for i in range(10)])
     np.testing.assert_allclose(result.first["velocity"][:, 1], (1 + e) / 2, atol=1e-15)
@@ -103,15 +122,21 @@ def test_given_samples_are_used_row_by_row():
     wanted = np.where((gaps[:, 0] < gaps[:, 1])[:, None], LEFT, RIGHT)
     np.testing.assert_allclose(result.mean, wanted.mean(axis=0), atol=1e-14)
     np.testing.assert_array_equal(np.asarray(result.replay(299)[1].gaps), gaps[299])
-    with pytest.raises(ValueError, match="`samples` must be at most 300, the rows of `gaps`"):
+    with pytest.raises(
+        ValueError, match="`samples` must be at most 300, the rows of `gaps`"
+    ):
         monte_carlo(LAW, BALLS, BEFORE, gaps, samples=301)
-    rows = np.array([[1.0, 0.0, -1.0], [0.5, 0.0, -1.0]])  # of velocities: they alone are random
+    rows = np.array(
+        [[1.0, 0.0, -1.0], [0.5, 0.0, -1.0]]
+    )  # of velocities: they alone are random
     result = monte_carlo(LAW, BALLS, rows, chunk=CHUNK)
     np.testing.assert_array_equal(result.first["velocity_before"], rows)
 
 
 def test_random_parameters_are_independent():
-    law = RandomLaw(ji.LZB(0.5, 1.0), restitution=Uniform(0.0, 1.0), stiffness=Uniform(1.0, 2.0))
+    law = RandomLaw(
+        ji.LZB(0.5, 1.0), restitution=Uniform(0.0, 1.0), stiffness=Uniform(1.0, 2.0)
+    )
     drawn = [law(jax.random.key(i)) for i in range(50)]
     e, k = np.array([[float(x.restitution), float(x.stiffness) - 1] for x in drawn]).T
     assert abs(np.corrcoef(e, k)[0, 1]) < 0.5
@@ -137,16 +162,28 @@ def test_truncated_normal_gaps():
     [
         ({"samples": 0}, ValueError, "`samples` must be an int >= 1, but has value 0"),
         ({"samples": -3}, ValueError, "`samples` must be an int >= 1"),
-        ({"samples": 1e3}, ValueError, "`samples` must be an int >= 1, but has value 1000.0"),
+        (
+            {"samples": 1e3},
+            ValueError,
+            "`samples` must be an int >= 1, but has value 1000.0",
+        ),
         ({"samples": True}, ValueError, "`samples` must be an int >= 1"),
         ({"chunk": 0}, ValueError, "`chunk` must be an int >= 1"),
         ({"bins": 0}, ValueError, "`bins` must be an int >= 1"),
         ({"key": "seed"}, TypeError, "`key` must be a JAX random key or an integer"),
-        ({"key": jax.random.split(jax.random.key(0))}, ValueError, "`key` must be one key"),
+        (
+            {"key": jax.random.split(jax.random.key(0))},
+            ValueError,
+            "`key` must be one key",
+        ),
         ({"workers": 0}, ValueError, "`workers` must be an int >= 1"),
         ({"workers": -1}, ValueError, "`workers` must be an int >= 1"),
         ({"workers": "all"}, ValueError, "`workers` must be an int >= 1"),
-        ({"workers": 2, "executor": "devices"}, ValueError, "`workers` must be left out but for"),
+        (
+            {"workers": 2, "executor": "devices"},
+            ValueError,
+            "`workers` must be left out but for",
+        ),
         (
             {"executor": "cloud"},
             ValueError,
@@ -158,7 +195,11 @@ def test_truncated_normal_gaps():
         ({"velocity": [1.0, 0.0]}, ValueError, r"`velocity` must have shape \(3,\)"),
         ({"velocity": [1.0, np.nan, 0.0]}, ValueError, "`velocity` must be finite"),
         ({"gaps": None}, ValueError, "`gaps` must be given where neither"),
-        ({"gaps": [0.0, -1e-6]}, ValueError, "negative gap is an overlap.*`initial_energy`"),
+        (
+            {"gaps": [0.0, -1e-6]},
+            ValueError,
+            "negative gap is an overlap.*`initial_energy`",
+        ),
         (
             {"gaps": [[0.0, 1e-6], [0.0, -1e-6]]},
             ValueError,
@@ -169,9 +210,21 @@ def test_truncated_normal_gaps():
             ValueError,
             r"Uniform\(low=-1e-06, high=1e-05\) does.*`initial_energy`",
         ),
-        ({"gaps": Normal(-1e-6, 1e-5)}, ValueError, "mean of at least 0.*`initial_energy`"),
-        ({"gaps": Uniform(0.0, [1e-5] * 3)}, ValueError, "scalars or 2 values in `high`"),
-        ({"gaps": lambda key: jnp.zeros(3)}, ValueError, r"`gaps\(key\)` must have shape \(2,\)"),
+        (
+            {"gaps": Normal(-1e-6, 1e-5)},
+            ValueError,
+            "mean of at least 0.*`initial_energy`",
+        ),
+        (
+            {"gaps": Uniform(0.0, [1e-5] * 3)},
+            ValueError,
+            "scalars or 2 values in `high`",
+        ),
+        (
+            {"gaps": lambda key: jnp.zeros(3)},
+            ValueError,
+            r"`gaps\(key\)` must have shape \(2,\)",
+        ),
     ],
 )
 def test_bad_arguments_are_named(change, error, message):
@@ -184,10 +237,13 @@ def test_bad_distributions_are_named():
         Uniform(1.0, 0.0)
     with pytest.raises(ValueError, match="`std` must lie in"):
         Normal(0.0, 0.0)
-    with pytest.raises(ValueError, match="that can be random are restitution, but not `friction`"):
+    with pytest.raises(
+        ValueError, match="that can be random are restitution, but not `friction`"
+    ):
         RandomLaw(LAW, friction=Uniform(0.0, 1.0))
     with pytest.raises(
-        ValueError, match=r"`restitution` must lie in \[0, 1\], but Uniform.* can leave it"
+        ValueError,
+        match=r"`restitution` must lie in \[0, 1\], but Uniform.* can leave it",
     ):
         RandomLaw(LAW, restitution=Uniform(0.5, 1.5))
     with pytest.raises(ValueError, match="can leave it"):
@@ -211,11 +267,15 @@ def test_bad_draws_are_counted_listed_and_kept_apart():
     assert 0 < (~fine).sum() < 50
     assert result.statuses["bad_gap"] == result.samples - result.count
     assert len(result.bad) <= 20
-    assert [bad.index for bad in result.bad[: (~fine).sum()]] == np.flatnonzero(~fine)[:20].tolist()
+    assert [bad.index for bad in result.bad[: (~fine).sum()]] == np.flatnonzero(~fine)[
+        :20
+    ].tolist()
     bad = result.bad[0]
     assert bad.status == "bad_gap"
     assert np.asarray(result.replay(bad.index)[1].gaps).tobytes() == bad.gaps.tobytes()
-    np.testing.assert_allclose(np.abs(result.mean).max(), 0.92, atol=0.05)  # NaN went nowhere
+    np.testing.assert_allclose(
+        np.abs(result.mean).max(), 0.92, atol=0.05
+    )  # NaN went nowhere
     assert np.isfinite(result.gap_mean).all()
     report = str(result)
     assert f"bad_gap: {result.statuses['bad_gap']}, left out" in report
@@ -231,11 +291,14 @@ def test_failed_impacts_are_kept_apart():
     with pytest.warns(UserWarning, match="4 of 8 samples failed"):
         result = monte_carlo(law, BALLS, rows, [0.0, 1e-6], chunk=8)
     assert result.statuses == {"ok": 4, "max_steps": 4}
-    np.testing.assert_allclose(result.mean, impact(law, BALLS, rows[0]).velocity, atol=1e-15)
+    np.testing.assert_allclose(
+        result.mean, impact(law, BALLS, rows[0]).velocity, atol=1e-15
+    )
     assert [bad.index for bad in result.bad] == [1, 3, 5, 7]
     np.testing.assert_array_equal(result.bad[0].velocity, rows[1])
     with pytest.raises(
-        RuntimeError, match="None of the first 8 samples gave a usable outcome: 8 max_steps"
+        RuntimeError,
+        match="None of the first 8 samples gave a usable outcome: 8 max_steps",
     ):
         monte_carlo(law, BALLS, rows[1:2].repeat(8, axis=0), [0.0, 1e-6], chunk=8)
 
@@ -260,7 +323,9 @@ def test_a_quantile_is_a_number(whole):
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
     sampled(folder=tmp_path)
-    with pytest.raises(ValueError, match="holds another run, which differs in gaps, key:"):
+    with pytest.raises(
+        ValueError, match="holds another run, which differs in gaps, key:"
+    ):
         sampled(folder=tmp_path, gaps=Uniform(0.0, 2e-5), key=1)
     with pytest.raises(ValueError, match="differs in law:"):
         sampled(folder=tmp_path, law=Binary(0.9, order="earliest"))
@@ -296,7 +361,9 @@ def test_a_run_is_as_fine_as_its_standard_errors_need(tmp_path):
     assert 0 < moved.max() <= result.rtol_error
     after, before = result.first["velocity"], result.first["velocity_before"][:, 2]
     parts = after / before[:, None]  # of a scale: v+ is proportional to v-
-    np.testing.assert_allclose(parts, np.broadcast_to(parts[:1], parts.shape), rtol=1e-3)
+    np.testing.assert_allclose(
+        parts, np.broadcast_to(parts[:1], parts.shape), rtol=1e-3
+    )
     law, *where = result.replay(7)
     np.testing.assert_allclose(impact(law, *where).velocity, after[7], rtol=1e-13)
     few = struck(samples=700)  # looking would take longer than it saves
@@ -331,11 +398,17 @@ def test_an_impact_to_a_given_tolerance():
     assert float(out.accuracy) == 1e-3
     own = impact(coarse, BALLS, before, rtol=1e-8).velocity  # the law's own holds
     np.testing.assert_allclose(own, wanted, rtol=1e-14)
-    with pytest.raises(ValueError, match=r"`rtol` must lie in \(0, 1\], but has value 0"):
+    with pytest.raises(
+        ValueError, match=r"`rtol` must lie in \(0, 1\], but has value 0"
+    ):
         impact(LOSSY, BALLS, before, rtol=0.0)
-    with pytest.raises(ValueError, match=r"`rtol` must be at least 3\.6e-15 in float64"):
+    with pytest.raises(
+        ValueError, match=r"`rtol` must be at least 3\.6e-15 in float64"
+    ):
         impact(LOSSY, BALLS, before, rtol=1e-20)
-    traced = jax.jit(jax.vmap(lambda rtol: impact(LOSSY, BALLS, before, rtol=rtol).status))
+    traced = jax.jit(
+        jax.vmap(lambda rtol: impact(LOSSY, BALLS, before, rtol=rtol).status)
+    )
     codes = traced(jnp.array([1e-3, 0.0, 1e-20, 2.0, -1.0, jnp.inf, jnp.nan]))
     names = [STATUS[int(code)].name for code in codes]
     assert names == ["ok", *["out_of_range"] * 5, "not_finite"]
@@ -349,7 +422,9 @@ def test_the_linearization_beside_monte_carlo():
     close = gap_sensitivity(law, BALLS, BEFORE, narrow.gap_mean, narrow)
     np.testing.assert_allclose(close.explained, 1.0, atol=0.02)
     assert "nearly linear" in str(close)
-    scale = ji.theory.gap_scale(BALLS, law, BEFORE).delta  # the report has gaps in units of it
+    scale = ji.theory.gap_scale(
+        BALLS, law, BEFORE
+    ).delta  # the report has gaps in units of it
     np.testing.assert_array_equal(narrow.gap_scale, scale)
     ratio = narrow.gap_mean[0] / scale[0]
     assert f"in units of delta_c = {scale[0]:.3g} m: {ratio:.3g} and " in str(narrow)
@@ -363,10 +438,14 @@ def test_the_linearization_beside_monte_carlo():
     rows = np.array([[0.3 + h, 0.32], [0.3 - h, 0.32]])
     pair = sampled(gaps=rows, **(sampler | {"samples": 2})).first["velocity"]
     exact = gap_sensitivity(law, BALLS, BEFORE, [0.3, 0.32])
-    np.testing.assert_allclose(exact.jacobian[:, 0], (pair[0] - pair[1]) / (2 * h), atol=1e-4)
+    np.testing.assert_allclose(
+        exact.jacobian[:, 0], (pair[0] - pair[1]) / (2 * h), atol=1e-4
+    )
     # moving everything apart by the same time changes nothing: both contacts approach at speed 1
     np.testing.assert_allclose(exact.jacobian.sum(axis=1), 0.0, atol=1e-6)
-    np.testing.assert_allclose(exact.covariance(np.eye(2)), exact.jacobian @ exact.jacobian.T)
+    np.testing.assert_allclose(
+        exact.covariance(np.eye(2)), exact.jacobian @ exact.jacobian.T
+    )
 
 
 @pytest.mark.release

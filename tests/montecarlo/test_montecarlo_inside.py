@@ -36,7 +36,8 @@ def same(a, b):
     """Bitwise, in everything but the time it took."""
     names = "samples count mean covariance minimum maximum gap_mean gap_covariance edges counts statuses first"
     return all(
-        fingerprint(getattr(a, name)) == fingerprint(getattr(b, name)) for name in names.split()
+        fingerprint(getattr(a, name)) == fingerprint(getattr(b, name))
+        for name in names.split()
     ) and (fingerprint(a.bad) == fingerprint(b.bad))
 
 
@@ -49,8 +50,12 @@ def test_float32_samples_are_summed_in_float64():
         whole = merged(whole, moments(part))
     assert whole["used"] == 200_000
     np.testing.assert_allclose(whole["mean"], exact.mean(axis=1), rtol=1e-14)
-    np.testing.assert_allclose(whole["products"][0, 0] / 199_999, exact.var(ddof=1), rtol=1e-10)
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), (Newton(0.5), chain([1.0, 1.0])))
+    np.testing.assert_allclose(
+        whole["products"][0, 0] / 199_999, exact.var(ddof=1), rtol=1e-10
+    )
+    single = jax.tree.map(
+        lambda x: x.astype(jnp.float32), (Newton(0.5), chain([1.0, 1.0]))
+    )
     ends = Uniform(*(jnp.float32(x) for x in (1.0, 2.0)))
     result = monte_carlo(
         single[0],
@@ -74,8 +79,14 @@ def test_histograms_hold_what_lies_outside_the_first_range():
     assert counts[0, -1] == 2
     assert counts[1].max() == 4
     low, high = np.array([-5.0, 3.0]), np.array([9.0, 3.0])
-    assert histograms.binned_quantiles(0.0, ends, counts, low, high).tolist() == [-5.0, 3.0]
-    assert histograms.binned_quantiles(1.0, ends, counts, low, high).tolist() == [9.0, 3.0]
+    assert histograms.binned_quantiles(0.0, ends, counts, low, high).tolist() == [
+        -5.0,
+        3.0,
+    ]
+    assert histograms.binned_quantiles(1.0, ends, counts, low, high).tolist() == [
+        9.0,
+        3.0,
+    ]
     assert -5.0 <= histograms.binned_quantiles(0.2, ends, counts, low, high)[0] <= -0.1
 
 
@@ -95,7 +106,9 @@ def test_bad_samples_are_numbered_over_all_chunks():
         "velocity": np.arange(16.0).reshape(8, 2),
         "status": np.array([0, 0, row, 0, 0, row, 0, 0]),
     }
-    task = histograms.Task(number=3, count=5, ends=np.array([[0.0, 9.0], [0.0, 9.0]]), rows={})
+    task = histograms.Task(
+        number=3, count=5, ends=np.array([[0.0, 9.0], [0.0, 9.0]]), rows={}
+    )
     chunk = histograms.reduced(task, samples, 4, False)
     assert chunk["bad.index"].tolist() == [3 * 8 + 2]
     assert chunk["used"] == 4
@@ -134,7 +147,9 @@ def test_interrupted_runs_continue_with_the_same_bits(tmp_path, whole):
     assert again.resumed == 1000
     assert same(again, whole)
     assert "all read from the folder" in str(again)
-    with pytest.raises(KeyboardInterrupt, match="nothing is stored, because no `folder` was given"):
+    with pytest.raises(
+        KeyboardInterrupt, match="nothing is stored, because no `folder` was given"
+    ):
         sampled(executor=Stops(1))
 
 
@@ -152,7 +167,10 @@ def test_damaged_and_foreign_chunks_are_named_and_not_used(tmp_path, whole):
     content = bytearray(chunks[1].read_bytes())
     at = len(content) // 2
     content[at] ^= 1
-    for path, damaged in ((chunks[1], bytes(content)), (chunks[2], chunks[2].read_bytes()[:500])):
+    for path, damaged in (
+        (chunks[1], bytes(content)),
+        (chunks[2], chunks[2].read_bytes()[:500]),
+    ):
         path.write_bytes(damaged)
     shutil.copy(tmp_path / "b" / chunks[3].name, chunks[3])
     with pytest.warns(UserWarning, match="is not used") as caught:
@@ -184,7 +202,9 @@ def test_every_single_flipped_byte_is_seen(tmp_path):
             arrays = store._checked(path, run)
         except Exception:
             continue
-        assert fingerprint(arrays) == fingerprint(reference)  # a byte that carries nothing
+        assert fingerprint(arrays) == fingerprint(
+            reference
+        )  # a byte that carries nothing
 
 
 def test_a_full_disk_is_reported_and_costs_nothing(tmp_path, monkeypatch, whole):
@@ -220,7 +240,9 @@ def test_functions_are_known_by_source_and_closure():
     assert fingerprint(scaled(1.0)) != fingerprint(scaled(2.0))
     assert fingerprint(scaled(1.0)) != fingerprint(sometimes_bad)
     assert fingerprint(LAW) != fingerprint(Binary(1.0))  # static fields count
-    assert fingerprint(chain([1.0, 1.0], wall=True)) != fingerprint(chain([1.0, 1.0], wall="left"))
+    assert fingerprint(chain([1.0, 1.0], wall=True)) != fingerprint(
+        chain([1.0, 1.0], wall="left")
+    )
 
 
 @pytest.mark.slow
@@ -250,7 +272,9 @@ monte_carlo(ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25]), [1.0,
     assert same(result, whole)
 
 
-LAWS = registered_laws({"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np.eye(2)})[0]
+LAWS = registered_laws(
+    {"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np.eye(2)}
+)[0]
 
 
 @pytest.mark.slow

@@ -23,7 +23,9 @@ def dropped(e, q0, slow):
 
 def bounce_times(e, n=20):
     first = np.sqrt(2 / G)
-    return first + 2 * first * jnp.concatenate([jnp.zeros(1), jnp.cumsum(e ** jnp.arange(1.0, n))])
+    return first + 2 * first * jnp.concatenate(
+        [jnp.zeros(1), jnp.cumsum(e ** jnp.arange(1.0, n))]
+    )
 
 
 def height(e, t):
@@ -51,5 +53,9 @@ def stack_gaps(q):
 
 def stack(e, q, v, t_end, between=0.0, **options):
     """Three bodies in a column, on the host: one program for many tests."""
-    system = ji.System(stack_gaps, [1.0] * 3, potential=Pull(*jnp.array([10.0, between])))
-    return ji.simulate(system, ji.Moreau(jnp.asarray(e)), q, v, t_end, samples=2, **options)
+    system = ji.System(
+        stack_gaps, [1.0] * 3, potential=Pull(*jnp.array([10.0, between]))
+    )
+    return ji.simulate(
+        system, ji.Moreau(jnp.asarray(e)), q, v, t_end, samples=2, **options
+    )

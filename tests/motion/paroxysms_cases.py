@@ -38,7 +38,11 @@ def sliding(q):
 
 
 ROD = ji.System(
-    gap, INERTIA, potential=ji.gravity([0.0, 1.0, 0.0], G), tangent_function=sliding, friction=MU
+    gap,
+    INERTIA,
+    potential=ji.gravity([0.0, 1.0, 0.0], G),
+    tangent_function=sliding,
+    friction=MU,
 )
 
 
@@ -58,7 +62,9 @@ def moves(given, law=ji.LZB):
     e, friction, theta, rate, slip = given
     q = jnp.stack([jnp.zeros_like(theta), jnp.sin(theta), theta])
     v = jnp.stack([slip - jnp.sin(theta) * rate, jnp.cos(theta) * rate, rate])
-    return ji.simulate(ROD, law(e, friction=friction), q, v, T_END, samples=2, max_events=30)
+    return ji.simulate(
+        ROD, law(e, friction=friction), q, v, T_END, samples=2, max_events=30
+    )
 
 
 @functools.cache

@@ -17,8 +17,12 @@ def test_contact_problem_of_a_block():
     problem = ji.theory.contact_problem(BLOCK, Q, V)
     sin, cos = np.sin(Q[2]), np.cos(Q[2])
     arms = np.array([HIGH * sin + WIDE * cos, HIGH * sin - WIDE * cos]) / 2
-    np.testing.assert_allclose(problem.delassus, 1 / MASS + np.outer(arms, arms) / INERTIA)
-    turning = V[2] ** 2 / 2 * np.array([HIGH * cos - WIDE * sin, HIGH * cos + WIDE * sin])
+    np.testing.assert_allclose(
+        problem.delassus, 1 / MASS + np.outer(arms, arms) / INERTIA
+    )
+    turning = (
+        V[2] ** 2 / 2 * np.array([HIGH * cos - WIDE * sin, HIGH * cos + WIDE * sin])
+    )
     np.testing.assert_allclose(problem.free, -G + turning, rtol=1e-12)
     flat = ji.theory.contact_problem(BLOCK, [0.0, HIGH / 2, 0.0], [0.0, 0.0, 0.0])
     np.testing.assert_allclose(flat.forces(), MASS * G / 2)
@@ -31,7 +35,8 @@ def quasi(q, v):
     sin, cos = np.sin(q[2]), np.cos(q[2])
     arms = np.array([HIGH * sin + WIDE * cos, HIGH * sin - WIDE * cos]) / 2
     return np.append(
-        (v[1] + arms * v[2]) / np.sqrt(1 / MASS + arms**2 / INERTIA), np.sqrt(MASS) * v[0]
+        (v[1] + arms * v[2]) / np.sqrt(1 / MASS + arms**2 / INERTIA),
+        np.sqrt(MASS) * v[0],
     )
 
 
@@ -48,28 +53,38 @@ def test_quasi_lagrange_equations_of_a_block(force):
     normal, tangential = terms.rates(force)
     np.testing.assert_allclose(np.append(normal, tangential), rate, atol=1e-8)
     lambda_bar = terms.norm * np.array(force)
-    np.testing.assert_allclose(terms.matrix @ lambda_bar - terms.normal, rate[:2], atol=1e-8)
+    np.testing.assert_allclose(
+        terms.matrix @ lambda_bar - terms.normal, rate[:2], atol=1e-8
+    )
     np.testing.assert_allclose(np.diag(terms.matrix), 1.0, atol=1e-14)
 
 
 def test_force_of_a_bilateral_constraint():
     """A pendulum of length 2 beside a wall: `lambda = m (g y - v^2) / L^2 - lambda_u x / L^2`."""
-    body = ji.System(lambda q: q[:1], [MASS, MASS], potential=ji.gravity([0.0, MASS], G))
+    body = ji.System(
+        lambda q: q[:1], [MASS, MASS], potential=ji.gravity([0.0, MASS], G)
+    )
     angle, speed, push = 0.7, 1.3, 4.0
     q = 2.0 * np.array([np.sin(angle), -np.cos(angle)])
     v = speed * np.array([np.cos(angle), np.sin(angle)])
-    terms = ji.theory.quasi_lagrange(body, q, v, constraints=lambda q: jnp.array([q @ q - 4.0]) / 2)
+    terms = ji.theory.quasi_lagrange(
+        body, q, v, constraints=lambda q: jnp.array([q @ q - 4.0]) / 2
+    )
     assert terms.bilateral == 1
     free = MASS * (G * q[1] - speed**2) / 4
     np.testing.assert_allclose(terms.bilateral_forces(), [free], rtol=1e-12)
     pushed = terms.bilateral_forces([push])
     np.testing.assert_allclose(pushed, [free - push * q[0] / 4], rtol=1e-12)
-    np.testing.assert_allclose(terms.rates([push])[0][0], 0.0, atol=1e-12)  # it stays closed
+    np.testing.assert_allclose(
+        terms.rates([push])[0][0], 0.0, atol=1e-12
+    )  # it stays closed
 
 
 def test_what_is_refused():
     base = ji.System(
-        ji.Block(1.0, 2.0), gravity=True, base=ji.HarmonicBase(0.1, 1.0, direction="vertical")
+        ji.Block(1.0, 2.0),
+        gravity=True,
+        base=ji.HarmonicBase(0.1, 1.0, direction="vertical"),
     )
     with pytest.raises(ValueError, match="`system` must not have a moving base"):
         ji.theory.quasi_lagrange(base, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
@@ -94,6 +109,8 @@ def test_accelerations_of_a_motion():
     a = np.array([0, -G, 0]) + push / [
         MASS, MASS, INERTIA,
     ]  # fmt: skip
-    np.testing.assert_allclose(a, (v[k + 1] - v[k - 1]) / (t[k + 1] - t[k - 1]), atol=2e-3)
+    np.testing.assert_allclose(
+        a, (v[k + 1] - v[k - 1]) / (t[k + 1] - t[k - 1]), atol=2e-3
+    )
     gaps = (problem.delassus @ force + problem.free)[closed]
     np.testing.assert_allclose(gaps, 0.0, atol=1e-9)

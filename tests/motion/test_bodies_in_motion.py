@@ -66,10 +66,16 @@ def places():
         pairs=[(0, 1), (2, 0), (2, 1), (0, 3)], fixed=[wall], places=[wall.at([-2.0, 0.0, 1.0])],
     )  # fmt: skip
     rows = list(NEAREST.values())
-    rows.append(([0.0, 0.0, CORE[2] - 0.15], [0.0, 0.0, 1.0]))  # the middle inside, .03 m deep
+    rows.append(
+        ([0.0, 0.0, CORE[2] - 0.15], [0.0, 0.0, 1.0])
+    )  # the middle inside, .03 m deep
     q = [
         bodies.at(
-            [MIDDLE + TURN.apply(np.asarray(p) + 0.12 * np.asarray(n)), [-1.75, 2.3, 1.4], MIDDLE],
+            [
+                MIDDLE + TURN.apply(np.asarray(p) + 0.12 * np.asarray(n)),
+                [-1.75, 2.3, 1.4],
+                MIDDLE,
+            ],
             [quaternion(TURN.inv()), [1, 0, 0, 0], quaternion(TURN)],
         )
         for p, n in rows
@@ -107,8 +113,15 @@ def test_a_sphere_strikes_a_face_an_edge_and_a_corner():
     v = jnp.stack([jnp.zeros(12).at[:3].set(TURN.apply(-speed * n)) for _, n in rows])
 
     def run(e, q, v):
-        motion = ji.simulate(ji.System(bodies), ji.Newton(e), q, v, time, samples=2, max_events=3)
-        return motion.q[-1], motion.events.velocity_after[0], motion.events.count, motion.status
+        motion = ji.simulate(
+            ji.System(bodies), ji.Newton(e), q, v, time, samples=2, max_events=3
+        )
+        return (
+            motion.q[-1],
+            motion.events.velocity_after[0],
+            motion.events.count,
+            motion.status,
+        )
 
     @jax.jit
     @jax.vmap
@@ -132,12 +145,21 @@ def test_a_sphere_falls_over_the_edge_of_a_finite_wall_in_steps():
     """Beside the wall it passes; on its top it bounces to e^2 of its height."""
     wall = ji.Box([0.1, 2.0, 1.0])
     bodies = ji.Bodies(
-        [ji.Sphere(RADIUS), ji.Sphere(RADIUS)], fixed=[wall], places=[wall.at([0.0, 0.0, 0.5])]
+        [ji.Sphere(RADIUS), ji.Sphere(RADIUS)],
+        fixed=[wall],
+        places=[wall.at([0.0, 0.0, 0.5])],
     )
     system = ji.System(bodies, gravity=10.0)
     q = bodies.at([[0.0, 0.5, 1.3], [0.0, 1.101, 1.3]])
     motion = ji.simulate(
-        system, ji.Newton(0.5), q, np.zeros(12), 0.3, samples=4, method="time_stepping", step=1e-3
+        system,
+        ji.Newton(0.5),
+        q,
+        np.zeros(12),
+        0.3,
+        samples=4,
+        method="time_stepping",
+        step=1e-3,
     )
     ji.raise_on_failure(motion)
     rebound = 0.5 * np.sqrt(2 * 10 * 0.2)

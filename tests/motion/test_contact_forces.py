@@ -15,7 +15,9 @@ G, HEIGHT = 9.80665, 1.0
 def bounces(stiffness):
     """Times of two closings and openings of a ball of 1 kg on a linear spring, and its impulses."""
     speed, w = np.sqrt(2 * G * HEIGHT), jnp.sqrt(stiffness)
-    lasts = 2 * (np.pi - jnp.arctan(speed * w / G)) / w  # x'' = g - w^2 x, back to x = 0
+    lasts = (
+        2 * (np.pi - jnp.arctan(speed * w / G)) / w
+    )  # x'' = g - w^2 x, back to x = 0
     first, push = speed / G, 2 * speed + G * lasts
     later = 3 * first + lasts
     return jnp.stack([first, first + lasts, later, later + lasts, push, push])
@@ -23,7 +25,12 @@ def bounces(stiffness):
 
 def dropped(force, end=1.0, **options):
     options = {"samples": 11, "max_events": 20} | options
-    given = (ji.System(ji.Column([1.0]), gravity=True), ji.Compliant(force), [HEIGHT], [0.0])
+    given = (
+        ji.System(ji.Column([1.0]), gravity=True),
+        ji.Compliant(force),
+        [HEIGHT],
+        [0.0],
+    )
     return ji.simulate(*given, end, method="contact_forces", **options)
 
 
@@ -39,7 +46,9 @@ def test_ball_on_a_linear_spring():
     slope, motion = jax.jit(jax.jacrev(run, has_aux=True))(stiffness)
     exact, exact_slope = jax.jvp(bounces, (stiffness,), (1.0,))
     rows = motion.events
-    np.testing.assert_allclose([*rows.time[:4], *rows.impulse[1:4:2, 0]], exact, rtol=1e-9)
+    np.testing.assert_allclose(
+        [*rows.time[:4], *rows.impulse[1:4:2, 0]], exact, rtol=1e-9
+    )
     np.testing.assert_allclose(slope, exact_slope, rtol=1e-8, atol=1e-14)
     assert motion.to_dict()["events"]["kind"] == ["contact", "detachment"] * 2
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
@@ -82,7 +91,9 @@ def test_a_body_may_rest_on_its_springs():
     height = jnp.asarray(0.2 - sunk)
     q, slope = jax.jit(lambda x: jax.jvp(run, (x,), (jnp.ones_like(x),)))(height)
     np.testing.assert_allclose(q, [[0.0, height, 0.0]] * 3, atol=1e-12)
-    np.testing.assert_allclose(slope[:, 1], np.cos(100 * np.array([0, 0.05, 0.1])), atol=1e-6)
+    np.testing.assert_allclose(
+        slope[:, 1], np.cos(100 * np.array([0, 0.05, 0.1])), atol=1e-6
+    )
 
 
 def on_a_slope(mu, angle):
@@ -93,7 +104,10 @@ def on_a_slope(mu, angle):
 
     functions = {"potential": height, "tangent_function": lambda q: q[:1]}
     system = ji.System(lambda q: q[1:], [1.0, 1.0], **functions)
-    law, sunk = ji.Compliant(ji.LinearSpring(1e4), friction=mu), G * jnp.cos(angle) / 1e4
+    law, sunk = (
+        ji.Compliant(ji.LinearSpring(1e4), friction=mu),
+        G * jnp.cos(angle) / 1e4,
+    )
     start = jnp.stack([0 * sunk, -sunk]), jnp.stack([0 * sunk - 1, 0 * sunk])
     options = {"samples": 3, "max_events": 8, "method": "contact_forces"}
     motion = ji.simulate(system, law, *start, 1.0, **options)
@@ -128,7 +142,9 @@ def test_derivatives_of_friction_on_a_slope():
     """In reverse mode, of the rest on its spring too."""
     run = jax.jit(jax.grad(on_a_slope, (0, 1), has_aux=True))
     for start in ((0.35, 0.3), (0.2, 0.3)):
-        np.testing.assert_allclose(run(*start)[0], jax.grad(slid, (0, 1))(*start), atol=1e-8)
+        np.testing.assert_allclose(
+            run(*start)[0], jax.grad(slid, (0, 1))(*start), atol=1e-8
+        )
 
 
 @pytest.mark.release
@@ -138,18 +154,27 @@ def test_a_ball_in_space_slides_and_rolls():
     system, law = ji.System(ball, gravity=True), ji.LinearSpring(stiffness)
     law = ji.Compliant(law, friction=mu)
     options = {"samples": 3, "max_events": 8, "method": "contact_forces"}
-    at, along = [0.0, 0.0, 0.1 - G / stiffness, 1.0, 0.0, 0.0, 0.0], np.array([0.75, 1.0])
+    at, along = (
+        [0.0, 0.0, 0.1 - G / stiffness, 1.0, 0.0, 0.0, 0.0],
+        np.array([0.75, 1.0]),
+    )
     motion = ji.simulate(system, law, at, [*along, 0, 0, 0, 0], 1.0, **options)
-    assert float(motion.events.time[0]) == pytest.approx(2 * 1.25 / (7 * mu * G), rel=1e-9)
+    assert float(motion.events.time[0]) == pytest.approx(
+        2 * 1.25 / (7 * mu * G), rel=1e-9
+    )
     rolls = [*along * 5 / 7, 0, *np.array([-along[1], along[0]]) * 50 / 7, 0]
     np.testing.assert_allclose(motion.velocity[-1], rolls, atol=1e-9)
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
     at[2], along = 0.11, 2 * along
     motion = ji.simulate(system, law, at, [*along, -0.2, 0, 0, 0], 0.2, **options)
-    push, side = (x[1] for x in (motion.events.impulse, motion.events.tangential_impulse))
+    push, side = (
+        x[1] for x in (motion.events.impulse, motion.events.tangential_impulse)
+    )
     lost = mu * push[0] * along / np.linalg.norm(along)
     np.testing.assert_allclose(side, -lost, rtol=1e-9)
-    np.testing.assert_allclose(motion.events.velocity_after[1, :2], along - lost, atol=1e-9)
+    np.testing.assert_allclose(
+        motion.events.velocity_after[1, :2], along - lost, atol=1e-9
+    )
 
 
 @pytest.mark.release
@@ -195,7 +220,14 @@ def test_a_box_that_lands_flat_drags_a_corner_through_its_end_of_slip():
     q = [0, 0, 0.0501, math.cos(turn), 0, 0, math.sin(turn)]
     v = [0.26, 0.12, -0.86, 0.39, 0.52, -3.57]
     motion = ji.simulate(
-        system, law, q, v, 0.03, method=ji.ContactForces(max_steps=5000), samples=3, max_events=50
+        system,
+        law,
+        q,
+        v,
+        0.03,
+        method=ji.ContactForces(max_steps=5000),
+        samples=3,
+        max_events=50,
     )
     ji.raise_on_failure(motion)
     end = [-0.015664, -0.00104, 0.498739, -0.127854, -0.290198, -0.000231]
@@ -204,15 +236,26 @@ def test_a_box_that_lands_flat_drags_a_corner_through_its_end_of_slip():
 
 
 def test_what_contact_forces_need():
-    ball = (ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5), [1.0], [0.0], 1.0)
-    with pytest.raises(TypeError, match="`law` must use gaps and have a `contact_force`"):
+    ball = (
+        ji.System(ji.Column([1.0]), gravity=True),
+        ji.Newton(0.5),
+        [1.0],
+        [0.0],
+        1.0,
+    )
+    with pytest.raises(
+        TypeError, match="`law` must use gaps and have a `contact_force`"
+    ):
         ji.simulate(*ball, method="contact_forces")
 
 
 def test_a_body_under_loads_is_a_system():
     """The ready systems are bodies under gravity; functions make a body, too."""
     block = ji.Block(width=0.2, height=0.6, mass=2.0)
-    system, q = ji.System(ji.Block(0.2, 0.6, 2.0), gravity=True), jnp.array([0.1, 0.7, 0.3])
+    system, q = (
+        ji.System(ji.Block(0.2, 0.6, 2.0), gravity=True),
+        jnp.array([0.1, 0.7, 0.3]),
+    )
 
     def slid(q):
         c = block.corners
@@ -221,7 +264,9 @@ def test_a_body_under_loads_is_a_system():
     given = ji.System(block.gap_function, block.mass, tangent_function=slid)
     for body in (system.body, given.body):
         scene = body.scene(q)
-        for found, own in zip(jax.tree.leaves(scene), jax.tree.leaves(block.scene(q)), strict=True):
+        for found, own in zip(
+            jax.tree.leaves(scene), jax.tree.leaves(block.scene(q)), strict=True
+        ):
             np.testing.assert_allclose(found, own, atol=1e-15)
     assert float(system.potential(q)) == pytest.approx(2.0 * G * 0.7)
     with pytest.raises(ValueError, match="must not be given with a body"):
@@ -237,7 +282,9 @@ def test_a_contact_opens_where_a_force_that_is_positive_at_touch_ends():
     """An elastic force of 5 N + k x: from .2 m a ball comes back to .2 m, however often it bounces."""
     ball = ji.System(ji.Column([0.7]), gravity=9.81)
     law = ji.Compliant(ji.UserForce(lambda x, rate, p: 5.0 + 800.0 * x))
-    motion = ji.simulate(ball, law, [0.2], [0.0], 1.3, samples=131, method="contact_forces")
+    motion = ji.simulate(
+        ball, law, [0.2], [0.0], 1.3, samples=131, method="contact_forces"
+    )
     assert ji.STATUS[int(motion.status)].name == "ok"
     energy = np.asarray(motion.kinetic_energy + motion.potential_energy)
     free = np.asarray(motion.q[:, 0]) > 0

@@ -13,8 +13,14 @@ V = [1.0, 0.0, 0.0]
 
 MOTIONS = [
     ({"t_end": 0.0}, "`t_end` must be after the start at 0 s"),
-    ({"t_end": (1.0, 0.5)}, "`t_end` must be after the start at 1 s, but has value 0.5"),
-    ({"t_end": [0.0, 1.0, 2.0]}, r"`t_end` must be a time or a pair \(t_start, t_end\)"),
+    (
+        {"t_end": (1.0, 0.5)},
+        "`t_end` must be after the start at 1 s, but has value 0.5",
+    ),
+    (
+        {"t_end": [0.0, 1.0, 2.0]},
+        r"`t_end` must be a time or a pair \(t_start, t_end\)",
+    ),
     ({"t_end": ([0.0], 1.0)}, r"`t_end` must have shape \(\) \(a time, or a pair"),
     ({"t_end": np.nan}, "`t_end` must be finite"),
     ({"q0": [-0.1]}, "no penetration"),
@@ -30,7 +36,10 @@ MOTIONS = [
 ]
 
 REFUSED = [
-    (lambda: ji.plot.system(ji.Block(1.0, 1.0), [np.nan] * 3), r"`state` must be finite"),
+    (
+        lambda: ji.plot.system(ji.Block(1.0, 1.0), [np.nan] * 3),
+        r"`state` must be finite",
+    ),
     (
         lambda: ji.simulate(
             ji.Newton(0.5), ji.System(ji.Column([1.0]), gravity=True), [1.0], [0.0], 1.0
@@ -40,7 +49,9 @@ REFUSED = [
     (
         lambda: ji.simulate(
             ji.System(
-                ji.Column([1.0]), gravity=True, base=lambda t: jnp.where(t < 0.5, 0.0, jnp.nan)
+                ji.Column([1.0]),
+                gravity=True,
+                base=lambda t: jnp.where(t < 0.5, 0.0, jnp.nan),
             ),
             ji.Newton(0.5),
             [1.0],
@@ -49,8 +60,14 @@ REFUSED = [
         ),
         r"finite base motion.* at t = 0\.5",
     ),
-    (lambda: ji.System(lambda q: q, [1.0], base=lambda t: t), "`base_directions` must be given"),
-    (lambda: ji.System(lambda q: q, [[1.0, 2.0], [2.0, 1.0]]), "`mass` must be positive definite"),
+    (
+        lambda: ji.System(lambda q: q, [1.0], base=lambda t: t),
+        "`base_directions` must be given",
+    ),
+    (
+        lambda: ji.System(lambda q: q, [[1.0, 2.0], [2.0, 1.0]]),
+        "`mass` must be positive definite",
+    ),
     (lambda: ji.System(None, [1.0]), "`gap_function` must be a body or a function"),
     (
         lambda: ji.simulate(
@@ -64,10 +81,15 @@ REFUSED = [
     ),
     (lambda: ji.TimeStepping([0.1]), r"`step` must have shape \(\)"),
     (
-        lambda: ji.simulate(ji.Block(0.2, 0.6), ji.Newton(0.5), [0, 1, 0], [0, 0, 0], 1.0),
+        lambda: ji.simulate(
+            ji.Block(0.2, 0.6), ji.Newton(0.5), [0, 1, 0], [0, 0, 0], 1.0
+        ),
         r"but is Block.*ji\.System\(body, gravity=True\)",
     ),
-    (lambda: ji.System(lambda q: q), "`mass` must be given where `gap_function` is a function"),
+    (
+        lambda: ji.System(lambda q: q),
+        "`mass` must be given where `gap_function` is a function",
+    ),
 ]
 
 
@@ -80,4 +102,6 @@ def test_bad_input(call, message):
 def test_bad_motions(change, message):
     arguments = {"q0": [1.0], "v0": [0.0], "t_end": 1.0} | change
     with pytest.raises(ValueError, match=message):
-        ji.simulate(ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5), **arguments)
+        ji.simulate(
+            ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5), **arguments
+        )

@@ -23,7 +23,9 @@ def test_programs_of_batched_motions_solve_no_systems_by_lapack():
     system, law = ji.System(box, gravity=True), ji.Moreau(0.5, friction=0.3)
 
     def end(v):
-        return ji.simulate(system, law, box.touching(), v, 0.2, samples=2, max_events=5).velocity
+        return ji.simulate(
+            system, law, box.touching(), v, 0.2, samples=2, max_events=5
+        ).velocity
 
     text = jax.jit(jax.vmap(end)).lower(np.zeros((4, 6))).as_text()
     assert not any(f"lapack_d{kernel}" in text for kernel in ("trsm", "getrf", "potrf"))
@@ -32,7 +34,9 @@ def test_programs_of_batched_motions_solve_no_systems_by_lapack():
 @pytest.mark.slow
 def test_a_status_of_a_motion_is_a_row_of_the_one_table():
     ball = ji.System(lambda q: q, [1.0], potential=ji.gravity([1.0]))
-    motion = ji.simulate(ball, ji.Newton(0.9), [1.0], [0.0], 20.0, samples=2, max_events=3)
+    motion = ji.simulate(
+        ball, ji.Newton(0.9), [1.0], [0.0], 20.0, samples=2, max_events=3
+    )
     assert status_of(motion) == "max_events"
     assert "max_events" in str(motion).splitlines()[0]
 
@@ -67,7 +71,9 @@ def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
             body = ji.Bodies([ji.Block(width, height)])
             system = ji.System(body, gravity=True)
             start = [0, 1 + height / 2, 0]
-            motion = ji.simulate(system, ji.LZB(e, 1.0), start, [0.0, 0, 0], 10.0, samples=3)
+            motion = ji.simulate(
+                system, ji.LZB(e, 1.0), start, [0.0, 0, 0], 10.0, samples=3
+            )
             assert status_of(motion) == "ok"
             times = np.asarray(motion.event_times("impact"))[1:8]
             np.testing.assert_allclose(times, expected, rtol=1e-6)
@@ -114,7 +120,9 @@ def test_a_domino_reaches_the_next_one():
 @pytest.mark.release
 def test_a_corner_that_slides_over_an_edge_takes_no_energy():
     """Its normal jumps there: it strikes or parts. It lost .039 J, of which only the ledger told."""
-    blocks = ji.Bodies([ji.Block(0.3, 0.17), ji.Block(0.33, 0.16, mass=2.5)], pairs=[(0, 1)])
+    blocks = ji.Bodies(
+        [ji.Block(0.3, 0.17), ji.Block(0.33, 0.16, mass=2.5)], pairs=[(0, 1)]
+    )
     q = np.array([0, 0.085, 0, -0.025, 0.39, -1.0])
     system, law = ji.System(blocks, gravity=True), ji.Moreau(0.0, friction=0.1)
 
@@ -139,7 +147,9 @@ def test_bodies_at_rest_stay_in_contact():
 
     def work(mass):
         column = eqx.tree_at(lambda s: s.body.mass, beads, mass)
-        motion = ji.simulate(column, ji.LZB(0.5), [0.0, 0.0], [0.0, 0.0], 1.0, samples=11)
+        motion = ji.simulate(
+            column, ji.LZB(0.5), [0.0, 0.0], [0.0, 0.0], 1.0, samples=11
+        )
         return motion.q.sum() + motion.contact_work.sum(), motion.events.count
 
     slope, count = jax.jacfwd(work, has_aux=True)(jnp.ones(2))
@@ -161,7 +171,10 @@ def test_pendulums_that_swing_side_by_side_stay_together():
         start = jnp.full(3, angle), jnp.full(3, speed)
         return ji.simulate(cradle, ji.LZB(0.9), *start, 1.0, samples=6, max_events=4)
 
-    angles, speeds = jnp.array([-0.3, -0.2, 0.1, 0.0, 0.0]), jnp.array([0.0, 0.0, 0.0, 1.0, 0.3])
+    angles, speeds = (
+        jnp.array([-0.3, -0.2, 0.1, 0.0, 0.0]),
+        jnp.array([0.0, 0.0, 0.0, 1.0, 0.3]),
+    )
     motions = jax.jit(jax.vmap(swing))(angles, speeds)
     np.testing.assert_array_equal(motions.status, 0)
     np.testing.assert_array_equal(motions.events.count, 0)

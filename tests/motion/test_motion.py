@@ -27,7 +27,9 @@ def kinds(motion):
 @pytest.fixture(scope="module")
 def balls():
     """(motion, d motion / d e) of a batch, most of it bad: one program for many tests."""
-    run = jax.jit(jax.vmap(lambda e, *x: jax.jvp(lambda e: dropped(e, *x), (e,), (1.0,))))
+    run = jax.jit(
+        jax.vmap(lambda e, *x: jax.jvp(lambda e: dropped(e, *x), (e,), (1.0,)))
+    )
     return run(
         jnp.array([0.8, 0.8, 0.8, 0.99, 0.5, 0.5]),
         jnp.array([1.0, jnp.nan, -0.1, 1e-4, 0.5, 1.0]),
@@ -62,7 +64,9 @@ def test_finite_accumulation_is_passed(balls):
     end = motion.events.accumulation_end[last]
     np.testing.assert_allclose(end, first * (1 + 0.8) / (1 - 0.8), rtol=1e-12)
     # the ratio of the last two of 62 intervals: rounding grows with 1 / interval
-    np.testing.assert_allclose(slope.events.accumulation_end[last], 2 * first / 0.2**2, rtol=1e-6)
+    np.testing.assert_allclose(
+        slope.events.accumulation_end[last], 2 * first / 0.2**2, rtol=1e-6
+    )
     rest = np.asarray(motion.time) > float(end)
     assert rest.any()
     np.testing.assert_allclose(motion.q[rest], 0, atol=1e-12)
@@ -74,7 +78,9 @@ def test_hops_below_the_rounding_of_gaps_are_passed(balls):
     motion = lane(balls[0], 5)
     last = int(motion.events.count) - 1
     assert kinds(motion) == ["impact"] * last + ["accumulation"]
-    hops = np.asarray(motion.events.velocity_before)[: last + 1, 0] ** 2 / (2 * G) * 0.5**2
+    hops = (
+        np.asarray(motion.events.velocity_before)[: last + 1, 0] ** 2 / (2 * G) * 0.5**2
+    )
     eps = np.finfo(float).eps
     assert hops[last] < 100 * eps
     assert (hops[:last] > eps).all()
@@ -94,9 +100,16 @@ def test_contacts_that_share_bodies_come_to_rest_together():
         last = int(motion.events.count) - 1
         assert kinds(motion)[last] == "accumulation"
         begin, gap = motion.events.time[last], motion.events.accumulation_gap[last]
-        assert begin < rest < motion.events.accumulation_end[last] < rest + 5 * (rest - begin)
+        assert (
+            begin
+            < rest
+            < motion.events.accumulation_end[last]
+            < rest + 5 * (rest - begin)
+        )
         assert gap < 10 * slow * 0.1  # about that share of the first fall
-        meanwhile = stack(*dropped, (begin + rest) / 2, method=ji.EventDriven(slow=1e-12)).gaps[-1]
+        meanwhile = stack(
+            *dropped, (begin + rest) / 2, method=ji.EventDriven(slow=1e-12)
+        ).gaps[-1]
         assert 0 < np.max(meanwhile) <= gap
         np.testing.assert_array_less(np.abs(motion.q[-1]), 1e-12)
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-13)
@@ -115,7 +128,9 @@ def test_bodies_come_to_rest_on_each_other_while_they_fall():
 def test_lengths_may_be_in_any_unit():
     """The same fall from heights and within times in which weights are the same number."""
     heights = np.array([0.1, 0.101, 0.102])
-    metres, microns = (stack(0.5, 10.0**k * heights, [0.0] * 3, 10.0 ** (k / 2)) for k in (0, 6))
+    metres, microns = (
+        stack(0.5, 10.0**k * heights, [0.0] * 3, 10.0 ** (k / 2)) for k in (0, 6)
+    )
     assert status(microns) == status(metres) == "ok"
     assert kinds(microns)[:20] == kinds(metres)[:20]
     times = (motion.events.time[:20] for motion in (metres, microns))
@@ -132,7 +147,9 @@ def test_a_table_comes_to_rest_on_four_legs():
             [1.0, 0.05, 0.05],
             potential=ji.gravity([1.0, 0.0, 0.0]),
         )
-        motion = ji.simulate(table, ji.Moreau(0.5), [0.1, 0.05, 0.1], np.zeros(3), 3.0, samples=5)
+        motion = ji.simulate(
+            table, ji.Moreau(0.5), [0.1, 0.05, 0.1], np.zeros(3), 3.0, samples=5
+        )
         assert status(motion) == "ok"
         np.testing.assert_allclose(motion.q[-1], 0, atol=1e-12)
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
@@ -146,7 +163,9 @@ def test_a_bad_motion_ends_alone(balls):
     assert str(balls[0]) == "6 motions: 3 ok, 1 max_events, 1 penetration, 1 not_finite"
     impacts = kinds(lane(balls[0], 0)).count("impact")
     assert f"  events: {impacts} impact, 1 accumulation\n" in str(lane(balls[0], 0))
-    np.testing.assert_allclose(lane(balls[0], 4).events.time[0], np.sqrt(1 / G), atol=1e-12)
+    np.testing.assert_allclose(
+        lane(balls[0], 4).events.time[0], np.sqrt(1 / G), atol=1e-12
+    )
     failed, slope = lane(balls[0], 3), lane(balls[1], 3)
     assert np.isnan(np.asarray(failed.q)[-1]).all()
     for rate in (slope.q, slope.kinetic_energy, slope.contact_work):
@@ -169,7 +188,9 @@ def test_ledger_closes(balls):
         motion = lane(balls[0], i)
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
         # all of it was taken by the contact, each impact took (1 - e^2) of what was left
-        np.testing.assert_allclose(motion.contact_work[-1, 0, 0], -motion.energy[0], atol=1e-11)
+        np.testing.assert_allclose(
+            motion.contact_work[-1, 0, 0], -motion.energy[0], atol=1e-11
+        )
         taken = -np.asarray(motion.events.energy)[:5, 0, 0]
         expected = float(motion.energy[0]) * (1 - e**2) * e ** (2 * np.arange(5.0))
         np.testing.assert_allclose(taken, expected, rtol=1e-11)
@@ -187,7 +208,9 @@ def times_of(x):
 def exact_times(x):
     e, q0, g = x
     powers = e ** jnp.arange(1.0, 20)
-    return jnp.sqrt(2 * q0 / g) * (1 + 2 * jnp.concatenate([jnp.zeros(1), jnp.cumsum(powers)]))
+    return jnp.sqrt(2 * q0 / g) * (
+        1 + 2 * jnp.concatenate([jnp.zeros(1), jnp.cumsum(powers)])
+    )
 
 
 @pytest.mark.release
@@ -211,7 +234,9 @@ def test_second_derivatives_over_twenty_bounces():
 def test_derivatives_in_what_functions_close_over():
     def second(height):
         system = ji.System(lambda q: q - height, [1.0], potential=lambda q: 9.0 * q[0])
-        motion = ji.simulate(system, ji.Newton(0.7), [1.0], [0.0], 1.2, samples=3, max_events=10)
+        motion = ji.simulate(
+            system, ji.Newton(0.7), [1.0], [0.0], 1.2, samples=3, max_events=10
+        )
         return motion.events.time[1]
 
     exact = jax.grad(lambda h: 2.4 * jnp.sqrt(2 * (1 - h) / 9))(0.1)
@@ -239,7 +264,9 @@ def first_contact(plate, q0, v0):
     a, f, phase, rise, centre, width = plate
 
     def gap(t):
-        y = a * np.sin(2 * np.pi * f * t + phase) + rise * np.exp(-(((t - centre) / width) ** 2))
+        y = a * np.sin(2 * np.pi * f * t + phase) + rise * np.exp(
+            -(((t - centre) / width) ** 2)
+        )
         return q0 + v0 * t - G * t * t / 2 - y
 
     looks = np.linspace(0, 0.4, 100_001)
@@ -258,7 +285,11 @@ def test_no_event_is_missed_between_two_looks():
     a, f = 10 ** r.uniform(-4, -1.5, n), 10 ** r.uniform(0.5, 2.3, n)
     still = np.zeros(n)
     moves = [a, f, r.uniform(0, 6.28, n), still, still, still + 1]
-    rises = [r.uniform(0.01, 0.2, k), r.uniform(0.05, 0.35, k), 10 ** r.uniform(-2.5, -1.3, k)]
+    rises = [
+        r.uniform(0.01, 0.2, k),
+        r.uniform(0.05, 0.35, k),
+        10 ** r.uniform(-2.5, -1.3, k),
+    ]
     plates = [np.r_[x, y] for x, y in zip(moves, [np.zeros(k)] * 3 + rises)]
     high = r.uniform(0, 0.2, n) * (r.random(n) < 0.5)
     q = np.r_[a * r.uniform(1.001, 3, n) + high, r.uniform(0.21, 0.4, k)]
@@ -268,12 +299,18 @@ def test_no_event_is_missed_between_two_looks():
     def hit(plate, q, v):
         ball = ji.System(ji.Column([1.0]), gravity=True, base=Plate(*plate))
         options = {"samples": 2, "max_events": 1}
-        return ji.simulate(ball, ji.Newton(0.5), q[None], v[None], 0.4, **options).events.time[0]
+        return ji.simulate(
+            ball, ji.Newton(0.5), q[None], v[None], 0.4, **options
+        ).events.time[0]
 
     def graze(depth):
-        system = ji.System(lambda q: q + 1 - depth, [1.0], potential=lambda q: 0.5 * q[0] ** 2)
+        system = ji.System(
+            lambda q: q + 1 - depth, [1.0], potential=lambda q: 0.5 * q[0] ** 2
+        )
         found = [
-            ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 20.0, samples=s, max_events=1)
+            ji.simulate(
+                system, ji.Newton(0.5), [1.0], [0.0], 20.0, samples=s, max_events=1
+            )
             for s in (2, 11)
         ]
         return jnp.stack([motion.events.time[0] for motion in found])
@@ -282,7 +319,9 @@ def test_no_event_is_missed_between_two_looks():
     hits, grazes = run(plates, q, v, depth)
     exact = [first_contact(*given) for given in zip(np.transpose(plates), q, v)]
     np.testing.assert_allclose(hits, exact, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(grazes[:5].T, [np.arccos(depth[:5] - 1)] * 2, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        grazes[:5].T, [np.arccos(depth[:5] - 1)] * 2, rtol=0, atol=1e-9
+    )
     assert np.isnan(np.asarray(grazes[5])).all()
 
 
@@ -294,25 +333,39 @@ def test_ball_leaves_a_vibrating_plate():
     def run(a):
         base = ji.HarmonicBase(a, w / (2 * np.pi))
         system = ji.System(ji.Column([1.0]), gravity=True, base=base)
-        return ji.simulate(system, ji.Newton(0.0), [0.0], (a * w)[None], 0.7, samples=36)
+        return ji.simulate(
+            system, ji.Newton(0.0), [0.0], (a * w)[None], 0.7, samples=36
+        )
 
     both = jax.jit(lambda a: jax.jvp(run, (a,), (1.0,)), compiler_options=OPTIMIZED)
     motion, slope = both(jnp.asarray(amplitude))
-    exact, exact_slope = jax.jvp(lambda a: jnp.arcsin(G / a / w**2) / w, (amplitude,), (1.0,))
+    exact, exact_slope = jax.jvp(
+        lambda a: jnp.arcsin(G / a / w**2) / w, (amplitude,), (1.0,)
+    )
     assert kinds(motion)[:3] == ["detachment", "impact", "detachment"]
     np.testing.assert_allclose(motion.events.time[0], exact, atol=1e-11)
     np.testing.assert_allclose(slope.events.time[0], exact_slope, rtol=1e-7)
     # from then on a parabola, until it meets the plate
     s = motion.events.time[1] - exact
-    y = amplitude * np.sin(w * exact) + amplitude * w * np.cos(w * exact) * s - G * s**2 / 2
-    np.testing.assert_allclose(y, amplitude * jnp.sin(w * motion.events.time[1]), atol=1e-12)
+    y = (
+        amplitude * np.sin(w * exact)
+        + amplitude * w * np.cos(w * exact) * s
+        - G * s**2 / 2
+    )
+    np.testing.assert_allclose(
+        y, amplitude * jnp.sin(w * motion.events.time[1]), atol=1e-12
+    )
     period = motion.events.time[2] - motion.events.time[0]
-    np.testing.assert_allclose(period, 2 * np.pi / w, atol=1e-10)  # period after period the same
+    np.testing.assert_allclose(
+        period, 2 * np.pi / w, atol=1e-10
+    )  # period after period the same
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
     assert np.ptp(np.asarray(motion.base_work)) > 0.05
     together = np.asarray(motion.time) < float(exact)
     plate = amplitude * np.sin(w * np.asarray(motion.time))
-    np.testing.assert_allclose(np.asarray(motion.q)[together, 0], plate[together], atol=1e-13)
+    np.testing.assert_allclose(
+        np.asarray(motion.q)[together, 0], plate[together], atol=1e-13
+    )
 
 
 def on_slope(angle, speed, mu, e=0.0, drop=0.0, tilt=0.0, corners="all"):
@@ -320,7 +373,10 @@ def on_slope(angle, speed, mu, e=0.0, drop=0.0, tilt=0.0, corners="all"):
     block = ji.Block(0.2, 0.4, corners=corners)
     system = ji.System(block, potential=type(ji.gravity([0.0]))(weights), friction=mu)
     none = 0 * speed
-    q0, v0 = jnp.stack([none, 0.2 + drop + none, tilt + none]), jnp.stack([speed, none, none])
+    q0, v0 = (
+        jnp.stack([none, 0.2 + drop + none, tilt + none]),
+        jnp.stack([speed, none, none]),
+    )
     return ji.simulate(system, ji.Moreau(e), q0, v0, 1.0, samples=21)
 
 
@@ -360,7 +416,9 @@ def test_derivatives_of_a_block_that_comes_to_stick():
 
     def found(x):
         motion = on_slope(*x, corners="base")
-        return jnp.stack([motion.q[-1, 0], motion.events.time[0], motion.contact_work[-1].sum()])
+        return jnp.stack(
+            [motion.q[-1, 0], motion.events.time[0], motion.contact_work[-1].sum()]
+        )
 
     def exact(x):
         angle, speed, mu = x
@@ -383,7 +441,10 @@ def test_block_tips_about_its_corner(slides):
     corner = q[:, 0] + 0.1 * np.cos(q[:, 2]) + 0.2 * np.sin(q[:, 2])
     np.testing.assert_allclose(corner, 0.1, atol=1e-9)
     inertia = (0.2**2 + 0.4**2) / 3  # I_corner w^2 / 2 = work of gravity
-    fallen = np.asarray(motion.potential_energy)[0] - np.asarray(motion.potential_energy)[reached]
+    fallen = (
+        np.asarray(motion.potential_energy)[0]
+        - np.asarray(motion.potential_energy)[reached]
+    )
     np.testing.assert_allclose(0.5 * inertia * v[:, 2] ** 2, fallen, atol=1e-9)
     assert v[-1, 2] < -1
 
@@ -394,7 +455,9 @@ def test_nested_accumulations_are_passed_below_the_root_of_slow(slides):
     motion = lane(slides, 4)
     last = kinds(motion).index("accumulation", 12)
     v = np.asarray(motion.events.velocity_before)[: last + 1]
-    approach = np.maximum(-(v[:, 1:2] + v[:, 2:] * [-0.1, 0.1]), 0.0)  # tilted by 0.02 at most
+    approach = np.maximum(
+        -(v[:, 1:2] + v[:, 2:] * [-0.1, 0.1]), 0.0
+    )  # tilted by 0.02 at most
     assert 1e-4 < approach[last].max() / approach.max() < 2.5e-3
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     np.testing.assert_allclose(motion.gaps[-1, :2], 0, atol=1e-12)
@@ -417,7 +480,9 @@ def mean_error(motion_of, exact, step):
 @pytest.mark.release
 def test_time_stepping_is_of_first_order():
     exact = np.array([[height(0.8, t)] for t in np.linspace(0, 2, 11)])
-    coarse, fine = (mean_error(lambda h: stepped(0.8, h), exact, h) for h in (2e-3, 2e-4))
+    coarse, fine = (
+        mean_error(lambda h: stepped(0.8, h), exact, h) for h in (2e-3, 2e-4)
+    )
     assert fine < 3e-4
     assert 0.8 < np.log10(coarse / fine) < 1.2
 
@@ -481,7 +546,9 @@ def test_a_block_on_a_slope_stays_slides_and_stops():
     slows = g * (mu * np.cos(slope) - np.sin(slope))
     stops = moved(mu, -1.0, ji.Moreau)
     # it stops within a step
-    np.testing.assert_allclose(stops.q[-1, 0], -1 / (2 * slows), atol=1e-2 * slows * 1e-2)
+    np.testing.assert_allclose(
+        stops.q[-1, 0], -1 / (2 * slows), atol=1e-2 * slows * 1e-2
+    )
     np.testing.assert_allclose(stops.velocity[-1], 0, atol=1e-10)
     slides = moved(0.2, 0.0, ji.Moreau)
     gains = g * (np.sin(slope) - 0.2 * np.cos(slope))
@@ -531,7 +598,9 @@ def test_discs_fall_into_a_box_and_come_to_rest(n, columns, duration):
 
 def test_discs_are_a_body_like_others():
     """Gaps, slips and their gradients against those of the closed contacts in time stepping."""
-    pile = piles.discs([1.0, 2.0, 3.0], [0.1, 0.2, 0.1], planes=[[0.0, 2.0, 0.0], [3.0, 4.0, -1.0]])
+    pile = piles.discs(
+        [1.0, 2.0, 3.0], [0.1, 0.2, 0.1], planes=[[0.0, 2.0, 0.0], [3.0, 4.0, -1.0]]
+    )
     q = pile.at([[0.0, 0.1], [0.3, 0.1], [-0.2, 0.1]]) + jnp.array([0, 0, 0.3] * 3)
     near, gradients, slips = jax.jit(
         lambda q: (
@@ -550,7 +619,9 @@ def test_discs_are_a_body_like_others():
             found = np.zeros((4, 3))
             for body, part in zip(near.bodies[k], near.directions[k, row]):
                 found[int(body)] += np.asarray(part)
-            np.testing.assert_allclose(found[:3].reshape(-1), expected[:, column], atol=1e-15)
+            np.testing.assert_allclose(
+                found[:3].reshape(-1), expected[:, column], atol=1e-15
+            )
 
 
 @pytest.mark.release
@@ -564,7 +635,9 @@ def test_time_stepping_of_many_beads_comes_to_rest(law):
         ji.System(ji.Column(np.full(n, 0.1), 0.01), gravity=True), law, q, np.zeros(n), 1.0,
         method="time_stepping", step=2e-4, samples=11,
     )  # fmt: skip
-    assert status(motion) == "ok"  # contacts are struck again while it comes to rest, but softly
+    assert (
+        status(motion) == "ok"
+    )  # contacts are struck again while it comes to rest, but softly
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-9)
     np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-3)
     assert int(motion.events.count) > 5
@@ -581,11 +654,20 @@ def test_time_stepping_reports_what_it_cannot_resolve():
     pile = piles.discs(1.0, [0.1, 0.1], planes=[[0.0, 1.0, 0.0]], room=1)
     system, q = ji.System(pile, gravity=True), pile.at([[0.0, 0.1], [0.3, 0.1]])
     crowded = ji.simulate(
-        system, ji.Moreau(0.0), q, np.zeros(6), 0.1, samples=2, method="time_stepping", step=0.05
+        system,
+        ji.Moreau(0.0),
+        q,
+        np.zeros(6),
+        0.1,
+        samples=2,
+        method="time_stepping",
+        step=0.05,
     )
     assert status(crowded) == "room"
     with pytest.raises(ValueError, match="must be Moreau's"):
-        ji.simulate(system, ji.LZB(0.5), q, np.zeros(6), 0.1, method="time_stepping", step=0.05)
+        ji.simulate(
+            system, ji.LZB(0.5), q, np.zeros(6), 0.1, method="time_stepping", step=0.05
+        )
     fast = ji.simulate(
         system, ji.Moreau(0.0), q + jnp.array([0.0, 1.0, 0.0] * 2), [3.0, 0.0, 0.0] * 2, 0.1,
         samples=2, method="time_stepping", step=0.05,
@@ -593,7 +675,14 @@ def test_time_stepping_reports_what_it_cannot_resolve():
     assert status(fast) == "coarse_step"
     between = ji.System(lambda q: jnp.stack([q[0], 0.1 - q[0]]), [1.0])
     coarse = ji.simulate(
-        between, ji.Moreau(1.0), [0.05], [1.0], 3.0, samples=4, method="time_stepping", step=0.15
+        between,
+        ji.Moreau(1.0),
+        [0.05],
+        [1.0],
+        3.0,
+        samples=4,
+        method="time_stepping",
+        step=0.15,
     )
     assert status(coarse) == "coarse_step"
 
@@ -602,16 +691,22 @@ def test_time_stepping_reports_what_it_cannot_resolve():
 def test_contacts_that_still_approach_have_another_impact_at_once():
     """Moreau's law lets a separating contact close: the next impact is at the same instant."""
     system = ji.System(ji.Column([1.0, 1.0, 1.0]), gravity=True)
-    motion = ji.simulate(system, ji.Moreau(0.5), [0.0] * 3, [-1.0, -0.2, -0.2], 0.01, samples=2)
+    motion = ji.simulate(
+        system, ji.Moreau(0.5), [0.0] * 3, [-1.0, -0.2, -0.2], 0.01, samples=2
+    )
     assert status(motion) == "ok"
     times = np.asarray(motion.events.time)[: int(motion.events.count)]
     assert len(times) > 1
     assert (times[:2] == 0).all()
     assert (np.asarray(motion.gaps) > -1e-12).all()
-    pulls = ji.simulate(system, ji.Newton(0.5), [0.0] * 3, [0.0, 0.0, 1.0], 0.01, samples=2)
+    pulls = ji.simulate(
+        system, ji.Newton(0.5), [0.0] * 3, [0.0, 0.0, 1.0], 0.01, samples=2
+    )
     assert status(pulls) == "ok"
     assert int(pulls.events.count) == 0
-    squeezed = ji.simulate(system, ji.Newton(0.9), [0.0] * 3, [-1.0, 5.0, 5.0], 0.01, samples=2)
+    squeezed = ji.simulate(
+        system, ji.Newton(0.9), [0.0] * 3, [-1.0, 5.0, 5.0], 0.01, samples=2
+    )
     assert status(squeezed) == "law_failed"
     with pytest.raises(RuntimeError, match="law_failed"):
         ji.raise_on_failure(squeezed)
@@ -619,7 +714,14 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
 
 @pytest.mark.release
 def test_a_mass_matrix_that_turns_singular():
-    system = ji.System(lambda q: q + 1, lambda q: 1 - q, force=lambda q, v, t: jnp.ones(1))
-    assert status(ji.simulate(system, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "singular_mass"
-    nan = ji.System(lambda q: q + 1, [1.0], force=lambda q, v, t: jnp.where(q < 0.5, 1.0, jnp.nan))
+    system = ji.System(
+        lambda q: q + 1, lambda q: 1 - q, force=lambda q, v, t: jnp.ones(1)
+    )
+    assert (
+        status(ji.simulate(system, ji.Newton(0.5), [0.0], [1.0], 3.0))
+        == "singular_mass"
+    )
+    nan = ji.System(
+        lambda q: q + 1, [1.0], force=lambda q, v, t: jnp.where(q < 0.5, 1.0, jnp.nan)
+    )
     assert status(ji.simulate(nan, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "not_finite"

@@ -22,11 +22,15 @@ def test_derivatives_of_a_thrown_brick_agree_with_differences():
 
     def places(x):
         law = ji.Moreau(x[7], friction=x[6])
-        motion = ji.simulate(SYSTEM, law, q0, x[:6], 3 * 0.1679, samples=4, max_events=40)
+        motion = ji.simulate(
+            SYSTEM, law, q0, x[:6], 3 * 0.1679, samples=4, max_events=40
+        )
         return motion.q[jnp.array([1, 3])]
 
     def differences(a, b):
-        return jnp.stack([places(x + a * e) - places(x + b * e) for e in jnp.eye(8)], axis=2)
+        return jnp.stack(
+            [places(x + a * e) - places(x + b * e) for e in jnp.eye(8)], axis=2
+        )
 
     slope, forward = jax.jacfwd(places)(x), differences(h, 0)
     size = float(jnp.abs(slope[0]).max())
@@ -47,7 +51,9 @@ def test_a_spinning_box_slides_as_by_time_stepping():
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
     wrong = [
-        np.abs(thrown(q0, v0, 0.6, method="time_stepping", step=h).q[-1] - motion.q[-1]).max()
+        np.abs(
+            thrown(q0, v0, 0.6, method="time_stepping", step=h).q[-1] - motion.q[-1]
+        ).max()
         for h in (1e-3, 1e-4)
     ]
     assert wrong[1] < 1e-4
@@ -57,7 +63,9 @@ def test_a_spinning_box_slides_as_by_time_stepping():
 @pytest.mark.release
 def test_a_thrown_brick_comes_to_rest_on_a_face():
     motion = thrown(
-        BRICK.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 0.6
+        BRICK.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]),
+        [0.5, 0.2, 0.0, 3.0, 12.0, 5.0],
+        0.6,
     )
     assert ji.STATUS[int(motion.status)].name == "ok"
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
@@ -91,4 +99,6 @@ def test_derivatives_at_no_displacement_take_two_terms():
         once = lambda s: jax.jvp(path, (s,), (1.0,))[1]  # noqa: E731
         return jnp.stack(jax.jvp(once, (0.0,), (1.0,)))
 
-    np.testing.assert_allclose(rates(BRICK.nearby), rates(BRICK.moved), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        rates(BRICK.nearby), rates(BRICK.moved), rtol=1e-12, atol=1e-12
+    )

@@ -69,7 +69,14 @@ ROWS = [
     (0.7, 0.3, 0.3, 0.0, 0.0, 0.0),  # level
     (0.7, 0.0, 0.3, 0.2, 0.0, 0.0),  # straight down
     (0.7, 2.0, 0.3, 0.2, 0.0, 0.0),  # across: slip turns
-    (0.0, 0.0, 0.3, np.arctan(1.2), 0.0, 0.0),  # from rest, steeper than 7/2 mu: it slides on
+    (
+        0.0,
+        0.0,
+        0.3,
+        np.arctan(1.2),
+        0.0,
+        0.0,
+    ),  # from rest, steeper than 7/2 mu: it slides on
     (0.0, 0.0, 0.3, np.arctan(0.9), 0.0, 0.0),  # it rolls
     (0.0, 0.0, 0.1, 0.0, 14.0, 0.0),  # pulled until it slides
     (0.0, 0.0, 0.1, 0.0, 14.0, 3.0),  # while the pull turns
@@ -91,7 +98,9 @@ def kinds(motion):
 
 def on_plane(v, tilt):
     """Velocities (.., 2) down and across a slope."""
-    return np.stack([v[..., 0] * np.cos(tilt) - v[..., 2] * np.sin(tilt), v[..., 1]], axis=-1)
+    return np.stack(
+        [v[..., 0] * np.cos(tilt) - v[..., 2] * np.sin(tilt), v[..., 1]], axis=-1
+    )
 
 
 @pytest.mark.slow
@@ -108,7 +117,9 @@ def test_a_sphere_slides_until_it_rolls(spheres, row):
 @pytest.mark.slow
 def test_a_level_sphere_keeps_five_sevenths(spheres):
     motion = lane(spheres, 0)
-    np.testing.assert_allclose(motion.events.time[0], 2 * 0.7 / (7 * 0.3 * G), rtol=1e-13)
+    np.testing.assert_allclose(
+        motion.events.time[0], 2 * 0.7 / (7 * 0.3 * G), rtol=1e-13
+    )
     np.testing.assert_allclose(np.linalg.norm(motion.velocity[-1, :2]), 0.5, rtol=1e-14)
 
 
@@ -118,7 +129,9 @@ def test_a_sphere_slides_or_rolls_from_rest(spheres):
         motion, tilt = lane(spheres, row), ROWS[row][3]
         way = 0.5 * share * G * np.cos(tilt) * 0.6**2
         assert kinds(motion) == []
-        np.testing.assert_allclose(motion.q[-1, 0] - motion.q[0, 0], way * np.cos(tilt), rtol=1e-12)
+        np.testing.assert_allclose(
+            motion.q[-1, 0] - motion.q[0, 0], way * np.cos(tilt), rtol=1e-12
+        )
 
 
 @pytest.mark.slow
@@ -147,7 +160,9 @@ def test_slip_that_begins_turns_with_the_forces(spheres):
         return np.concatenate([pull(t) - friction * d, pull(t) - 3.5 * friction * d])
 
     options = {"method": "Radau", "rtol": 1e-11, "atol": 1e-13}
-    stick = solve_ivp(lambda t, y: 5 / 7 * pull(t), (0, start), [0.0, 0.0], **options).y[:, -1]
+    stick = solve_ivp(
+        lambda t, y: 5 / 7 * pull(t), (0, start), [0.0, 0.0], **options
+    ).y[:, -1]
     first = np.concatenate([stick, 1e-14 * pull(start)])
     end = solve_ivp(rates, (start, 0.6), first, **options).y[:2, -1]
     np.testing.assert_allclose(lane(spheres, 6).velocity[-1, :2], end, atol=3e-8)
@@ -176,7 +191,9 @@ def test_a_box_slides_to_rest():
     assert kinds(motion) == ["friction"]
     np.testing.assert_allclose(motion.events.time[0], speed / (0.4 * G), rtol=1e-9)
     way = speed**2 / (2 * 0.4 * G)
-    np.testing.assert_allclose(motion.q[-1, :2], way * np.array([1.0, 0.5]) / speed, atol=1e-10)
+    np.testing.assert_allclose(
+        motion.q[-1, :2], way * np.array([1.0, 0.5]) / speed, atol=1e-10
+    )
 
 
 COIN = ji.Coin(0.1, 0.02, mass=0.5)
@@ -197,8 +214,15 @@ def steadily():
     """
     a, b, m, (across, _, along) = 0.1, 0.01, 0.5, np.asarray(COIN.inertia)
     sine, cosine = np.sin(TILT), np.cos(TILT)
-    high, inward = a * sine + b * cosine, a * cosine - b * sine  # centre from the lowest point
-    moment = across * TURNS**2 * sine * cosine + m * b * TURNS**2 * sine * high - m * G * inward
+    high, inward = (
+        a * sine + b * cosine,
+        a * cosine - b * sine,
+    )  # centre from the lowest point
+    moment = (
+        across * TURNS**2 * sine * cosine
+        + m * b * TURNS**2 * sine * high
+        - m * G * inward
+    )
     spin = moment / (TURNS * (along * sine + m * a * high))
     speed = a * spin - b * TURNS * sine
     q0 = COIN.touching([np.cos(TILT / 2), 0.0, -np.sin(TILT / 2), 0.0])
@@ -214,7 +238,9 @@ def test_forces_of_a_coin_that_rolls_steadily():
     def held(q, v):
         contacts = contacts_at(ROLLS, q, v, jnp.zeros(()), True)
         touch = contacts.normal.value < 1e-9
-        force = forces(contacts, jnp.ones(2), Modes(touch, touch, jnp.ones(2)), jnp.zeros((2, 2)))
+        force = forces(
+            contacts, jnp.ones(2), Modes(touch, touch, jnp.ones(2)), jnp.zeros((2, 2))
+        )
         return contacts.normal, force.normal, force.acceleration
 
     normal, push, acceleration = held(q, v)
@@ -243,7 +269,9 @@ def test_a_coin_rolls_in_a_circle():
 def sliding(x):
     """Contact forces on a brick flat on the ground at x = (v_x, v_y, omega_z, mu)."""
     q, still = BRICK.touching(), jnp.zeros(())
-    contacts = contacts_at(SYSTEM, q, jnp.zeros(6).at[jnp.array([0, 1, 5])].set(x[:3]), still, True)
+    contacts = contacts_at(
+        SYSTEM, q, jnp.zeros(6).at[jnp.array([0, 1, 5])].set(x[:3]), still, True
+    )
     touch = contacts.normal.value < 1e-9
     slip = direction(by_contact(contacts.tangent.rate, 8))
     modes = Modes(touch, touch & False, jnp.ones(8))
@@ -257,8 +285,12 @@ def test_forces_of_a_brick_that_slides_flat_have_derivatives():
     normal, slope = share(x)
     np.testing.assert_allclose(normal.sum(), 0.5 * G, rtol=1e-12)
     # least squares: no part along the load of corners that cancels itself
-    np.testing.assert_allclose(normal @ jnp.array([1.0, 0, -1, 0, -1, 0, 1, 0]), 0, atol=1e-11)
-    central = [(share(x + h * e)[0] - share(x - h * e)[0]) / (2 * h) for e in jnp.eye(4)]
+    np.testing.assert_allclose(
+        normal @ jnp.array([1.0, 0, -1, 0, -1, 0, 1, 0]), 0, atol=1e-11
+    )
+    central = [
+        (share(x + h * e)[0] - share(x - h * e)[0]) / (2 * h) for e in jnp.eye(4)
+    ]
     np.testing.assert_allclose(slope, jnp.stack(central, axis=1), atol=1e-6)
 
 
@@ -325,7 +357,14 @@ ON_EDGES = [
             ],
             float,
         ),
-        [0.3878915399829281, -0.3869135591588362, -0.5564473205031455, -8.782470592250391, 0, 0],
+        [
+            0.3878915399829281,
+            -0.3869135591588362,
+            -0.5564473205031455,
+            -8.782470592250391,
+            0,
+            0,
+        ],
         0.9599740866892964,
         (3, 7),
     ),
@@ -338,7 +377,9 @@ def chosen(sizes, q, v, mu, before, touch, released):
     system = ji.System(box, gravity=True)
     contacts = contacts_at(system, q, v, jnp.zeros_like(mu), True)
     slack, slides = jnp.asarray(5e-10), jnp.zeros(8, bool)
-    return choose_with_friction(contacts, mu * jnp.ones(8), before, touch, released, slides, slack)
+    return choose_with_friction(
+        contacts, mu * jnp.ones(8), before, touch, released, slides, slack
+    )
 
 
 def test_who_sticks_and_who_slides():
@@ -362,12 +403,16 @@ def test_a_contact_that_lies_below_the_surface_may_leave_it():
     q = jnp.concatenate([BRICK.touching()[:3] + below, BRICK.touching()[3:]])
     rest = jnp.zeros((2, 8))
     state = State(q, jnp.zeros(6), still, still, still, rest, rest[:0])
-    settings = Settings(1e-10, 1e-12, 1e-9 * one, 1e-14 * one, 9, False, False, one, 1e-6 * one)
+    settings = Settings(
+        1e-10, 1e-12, 1e-9 * one, 1e-14 * one, 9, False, False, one, 1e-6 * one
+    )
     modes, times = no_modes(8, q.dtype), jnp.linspace(0, 1, 2)
 
     @jax.jit
     def margins(state):
-        flow = flow_of(SYSTEM, None, settings, modes, Scales(one, one, one), times, state)
+        flow = flow_of(
+            SYSTEM, None, settings, modes, Scales(one, one, one), times, state
+        )
         return flow.margins(modes, None, packed(state))[:8, 0]
 
     low = np.asarray(BRICK.gap_function(BRICK.touching())) < 1e-9

@@ -18,12 +18,18 @@ from jimpact.motion.transitions import impact_jump
 
 def test_what_a_motion_does_not_reach_has_no_derivatives():
     """NaN in both modes, unless its cotangent is 0; whatever the sum of the tangents is."""
-    known, inputs, move = jnp.array([True, False]), jnp.array([1.0, 2.0]), jnp.array([1.0, -1.0])
+    known, inputs, move = (
+        jnp.array([True, False]),
+        jnp.array([1.0, 2.0]),
+        jnp.array([1.0, -1.0]),
+    )
 
     def reached(x, known=known):
         return jnp.sum(x**2) + nan_derivatives(x, known)[:, 0]
 
-    np.testing.assert_array_equal(jax.jvp(reached, (inputs,), (move,))[1], [-2.0, jnp.nan])
+    np.testing.assert_array_equal(
+        jax.jvp(reached, (inputs,), (move,))[1], [-2.0, jnp.nan]
+    )
     pull = jax.vjp(reached, inputs)[1]
     np.testing.assert_array_equal(pull(jnp.array([1.0, 0.0]))[0], 2 * inputs)
     for cotangent in ([0.0, 1e-30], [1.0, -1.0]):
@@ -37,7 +43,9 @@ def test_what_a_motion_does_not_reach_has_no_derivatives():
         return [second(first(reached))(x, known) for first in modes for second in modes]
 
     for hessians in all_hessians(inputs, known):
-        np.testing.assert_array_equal(hessians[0], 2 * np.eye(2))  # as if both were known
+        np.testing.assert_array_equal(
+            hessians[0], 2 * np.eye(2)
+        )  # as if both were known
         assert np.isnan(hessians[1]).all()
 
 
@@ -57,7 +65,9 @@ def test_runs_of_the_program_follow_each_other():
     assert status(ended) == "max_events"
     assert int(ended.events.count) == CHUNK + 100
     for row, all_rows in zip(*(jax.tree.leaves(m.events)[1:] for m in (ended, motion))):
-        np.testing.assert_allclose(row, all_rows[: CHUNK + 100], rtol=1e-9)  # another program
+        np.testing.assert_allclose(
+            row, all_rows[: CHUNK + 100], rtol=1e-9
+        )  # another program
 
 
 @pytest.mark.slow  # compiles programs of its own
@@ -66,8 +76,14 @@ def test_a_motion_back_in_time_is_reported():
         ji.System(ji.Column([1.0]), gravity=True),
         SimpleNamespace(q=jnp.ones(1), v=jnp.ones(1), t=jnp.asarray(1.0)),
     )
-    codes = [status_at_start(ball, start, jnp.asarray(end), 1e-9) for end in (2.0, 1.0, 0.0)]
-    assert [ji.STATUS[int(code)].name for code in codes] == ["ok", "backward", "backward"]
+    codes = [
+        status_at_start(ball, start, jnp.asarray(end), 1e-9) for end in (2.0, 1.0, 0.0)
+    ]
+    assert [ji.STATUS[int(code)].name for code in codes] == [
+        "ok",
+        "backward",
+        "backward",
+    ]
 
 
 A_BASE, W_BASE = 0.1, 2 * np.pi * 1.5  # of a plate at A sin(w t)

@@ -13,7 +13,9 @@ SOFT = ji.Compliant(ji.LinearSpring(1e4))
 
 
 def drop(law=HARD, system=BALL, **options):
-    return ji.simulate(system, law, [0.1], [0.0], 0.5, samples=3, max_events=20, **options)
+    return ji.simulate(
+        system, law, [0.1], [0.0], 0.5, samples=3, max_events=20, **options
+    )
 
 
 @pytest.mark.parametrize(
@@ -23,7 +25,10 @@ def drop(law=HARD, system=BALL, **options):
         (HARD, {"method": "events"}, ji.EventDriven()),
         (HARD, {"method": "time_stepping", "step": 0.01}, ji.TimeStepping(0.01)),
         pytest.param(
-            SOFT, {"method": "contact_forces"}, ji.ContactForces(), marks=pytest.mark.slow
+            SOFT,
+            {"method": "contact_forces"},
+            ji.ContactForces(),
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -52,17 +57,31 @@ def test_options_act():
         (lambda: ji.ContactForces(rtol=np.nan), r"`rtol` must lie in \(0"),
         (lambda: ji.TimeStepping(0.0), r"`step` must lie in \(0"),
         (lambda: ji.TimeStepping(None), "`step` must be a number"),
-        (lambda: drop(step=0.1, method=ji.EventDriven()), "`step` must be left out where"),
-        (lambda: drop(step=0.1, method=ji.TimeStepping(0.1)), "`step` must be left out where"),
-        (lambda: drop(step=0.1), "`step` must be left out but for method='time_stepping'"),
-        (lambda: drop(method="event"), r"`method` must be one of .* Did you mean events\?"),
+        (
+            lambda: drop(step=0.1, method=ji.EventDriven()),
+            "`step` must be left out where",
+        ),
+        (
+            lambda: drop(step=0.1, method=ji.TimeStepping(0.1)),
+            "`step` must be left out where",
+        ),
+        (
+            lambda: drop(step=0.1),
+            "`step` must be left out but for method='time_stepping'",
+        ),
+        (
+            lambda: drop(method="event"),
+            r"`method` must be one of .* Did you mean events\?",
+        ),
         (lambda: ji.System(ji.Column([1.0]), friction=-0.1), "`friction` must lie in"),
         (
             lambda: drop(system=ji.System(ji.Column([1.0]), friction=0.3)),
             "`system` must have tangents for the friction of its contacts",
         ),
         (
-            lambda: drop(law=ji.Moreau(0.5, friction=0.3), system=ji.System(ji.Column([1.0]))),
+            lambda: drop(
+                law=ji.Moreau(0.5, friction=0.3), system=ji.System(ji.Column([1.0]))
+            ),
             "`system` must have tangents for the friction of its law",
         ),
         (
@@ -72,7 +91,10 @@ def test_options_act():
             ),
             "`system` must have tangents for the friction of its law",
         ),
-        (lambda: ji.System(ji.Column([1.0]), gravity=-9.81), "`gravity` must be >= 0, the size"),
+        (
+            lambda: ji.System(ji.Column([1.0]), gravity=-9.81),
+            "`gravity` must be >= 0, the size",
+        ),
     ],
 )
 def test_bad_options_are_named(make, message):
@@ -83,13 +105,19 @@ def test_bad_options_are_named(make, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ji.EventDriven(until_apart=True), "unexpected keyword argument 'until_apart'"),
+        (
+            lambda: ji.EventDriven(until_apart=True),
+            "unexpected keyword argument 'until_apart'",
+        ),
         (lambda: ji.ContactForces(slow=0.1), "unexpected keyword argument 'slow'"),
         (lambda: ji.TimeStepping(0.1, rtol=1e-6), "unexpected keyword argument 'rtol'"),
         (lambda: drop(rtol=1e-6), "unexpected keyword argument 'rtol'"),
         (lambda: drop(method=ji.EventDriven), "`method` must be one of events"),
         (lambda: drop(method=None), "`method` must be one of events"),
-        (lambda: drop(method=ji.ContactForces()), r"`law` must use gaps .* \(Compliant\)"),
+        (
+            lambda: drop(method=ji.ContactForces()),
+            r"`law` must use gaps .* \(Compliant\)",
+        ),
     ],
 )
 def test_options_of_another_method_are_refused(make, message):

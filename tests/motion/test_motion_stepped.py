@@ -36,7 +36,9 @@ def overturns(width, height, amplitude, frequency, duration):
     stiffness, kept = 3 * G / (4 * far), 1 - 1.5 * np.sin(slender) ** 2
 
     def pull(t):
-        return amplitude / G * np.sin(frequency * t) if t < 2 * np.pi / frequency else 0.0
+        return (
+            amplitude / G * np.sin(frequency * t) if t < 2 * np.pi / frequency else 0.0
+        )
 
     if amplitude <= G * np.tan(slender):
         return False
@@ -111,9 +113,13 @@ class Table(ji.Body):
 @pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
 def test_leaving_the_range_of_a_gap_function_is_reported(options):
     system = ji.System(Table(), potential=Table().gravity(G))
-    motion = ji.simulate(system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options)
+    motion = ji.simulate(
+        system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options
+    )
     assert status(motion) == "out_of_range"
-    assert 5 <= np.isfinite(np.asarray(motion.q[:, 0])).sum() <= 7  # x = 1 at the sixth sample
+    assert (
+        5 <= np.isfinite(np.asarray(motion.q[:, 0])).sum() <= 7
+    )  # x = 1 at the sixth sample
     with pytest.raises(ValueError, match="in the range of the gap function"):
         ji.simulate(system, ji.Moreau(0.5), [1.5, 0.1], [1.0, 0.0], 2.0, **options)
 
@@ -141,7 +147,9 @@ def test_a_superball_leaves_with_its_slip_reversed():
     )  # fmt: skip
     x, _, spin = motion.velocity[-1]
     np.testing.assert_allclose(x + 0.5 * spin, -e_t * (1.0 + 0.5 * 3.0), rtol=1e-6)
-    np.testing.assert_allclose(x - 1.0, 0.5 * 0.5 * (spin - 3.0), rtol=1e-6)  # m x' r = I spin
+    np.testing.assert_allclose(
+        x - 1.0, 0.5 * 0.5 * (spin - 3.0), rtol=1e-6
+    )  # m x' r = I spin
 
 
 @pytest.mark.release
@@ -186,16 +194,22 @@ def shrinking(q):
     ],
 )
 def test_what_goes_wrong_on_the_way_is_reported(gap, mass, restitution, expected):
-    run = jax.jit(lambda e: stepped(ji.System(gap, mass), ji.Moreau(e), [0.5003], [-1.0]))
+    run = jax.jit(
+        lambda e: stepped(ji.System(gap, mass), ji.Moreau(e), [0.5003], [-1.0])
+    )
     assert status(run(restitution)) == expected
 
 
 @pytest.mark.slow
 def test_a_motion_says_how_its_law_fails():
     motion = stepped(ROW, ji.Moreau(1.0), [0.0, 0.3, 0.6], [0.0] * 3)
-    codes = motion.events.status.at[0].set([x.name for x in ji.STATUS].index("negative_impulse"))
+    codes = motion.events.status.at[0].set(
+        [x.name for x in ji.STATUS].index("negative_impulse")
+    )
     failed = eqx.tree_at(
-        lambda m: (m.status, m.events.status), motion, (jnp.int32(CODE["law_failed"]), codes)
+        lambda m: (m.status, m.events.status),
+        motion,
+        (jnp.int32(CODE["law_failed"]), codes),
     )
     with pytest.raises(RuntimeError, match=r"law_failed: .*: negative_impulse"):
         ji.raise_on_failure(failed)
@@ -226,7 +240,9 @@ ROW = ji.System(lambda q: q[1:] - q[:-1] - 0.2, [1.0, 1.0, 1.0])
 def test_an_elastic_row_never_gains_energy():
     """The left ball strikes while the other two still leave each other."""
     motion = stepped(ROW, ji.Moreau(1.0), [0.0, 0.2004, 0.4004], [1.0, 0.0, 0.1])
-    np.testing.assert_allclose(motion.kinetic_energy, motion.kinetic_energy[0], rtol=1e-8)
+    np.testing.assert_allclose(
+        motion.kinetic_energy, motion.kinetic_energy[0], rtol=1e-8
+    )
 
 
 def test_impacts_closer_than_a_step_are_one():
@@ -274,7 +290,10 @@ def test_a_tossed_block_never_gains_energy():
 )
 def test_coefficients_that_do_not_fit_are_named(law, named):
     pile = piles.discs(1.0, [0.1, 0.1], planes=[[0.0, 1.0, 0.0]])
-    for body, q0 in ((pile, pile.at([[0.0, 0.1], [0.5, 0.1]])), (ji.Block(0.2, 0.4), [0, 0.2, 0])):
+    for body, q0 in (
+        (pile, pile.at([[0.0, 0.1], [0.5, 0.1]])),
+        (ji.Block(0.2, 0.4), [0, 0.2, 0]),
+    ):
         with pytest.raises(ValueError, match=named):
             stepped(ji.System(body), law, q0, np.zeros(len(q0)))
 
@@ -292,21 +311,38 @@ def test_tangents_that_do_not_fit_are_named():
     ("given", "named"),
     [
         ({"force": lambda q, v, t: v[:1]}, r"`force` that returns shape \(2,\)"),
-        ({"gap_function": lambda q: q[None]}, r"`gap_function` that returns shape \(m,\)"),
-        ({"gap_function": lambda q: q[:0]}, r"each of m >= 1 contacts, but it returns \(0,\)"),
+        (
+            {"gap_function": lambda q: q[None]},
+            r"`gap_function` that returns shape \(m,\)",
+        ),
+        (
+            {"gap_function": lambda q: q[:0]},
+            r"each of m >= 1 contacts, but it returns \(0,\)",
+        ),
         ({"potential": lambda q: q}, r"`potential` that returns shape \(\)"),
         ({"tangent_function": lambda q: q[None]}, r"`tangent_function` that returns"),
-        ({"base": lambda t: jnp.stack([t, t]), "base_directions": [[1.0], [0.0]]}, "`base` that"),
-        ({"base": lambda t: t, "base_directions": [[1.0]]}, "`base_directions` must have shape"),
+        (
+            {"base": lambda t: jnp.stack([t, t]), "base_directions": [[1.0], [0.0]]},
+            "`base` that",
+        ),
+        (
+            {"base": lambda t: t, "base_directions": [[1.0]]},
+            "`base_directions` must have shape",
+        ),
         ({"force": lambda q, v: v}, r"`force` that takes JAX arrays \(q, v, t\)"),
-        ({"force": lambda q, v, t: np.asarray(v)}, "`force` .* raises TracerArrayConversionError"),
+        (
+            {"force": lambda q, v, t: np.asarray(v)},
+            "`force` .* raises TracerArrayConversionError",
+        ),
         ({"force": lambda q, v, t: None}, "`force` .* returns None"),
         ({"gap_function": lambda q: [q[0]]}, "`gap_function` .* raises TypeError"),
         ({"gap_function": lambda q: 1}, "`gap_function` that returns floating numbers"),
     ],
 )
 def test_functions_of_a_system_must_return_what_they_should(given, named, options):
-    system = ji.System(**({"gap_function": lambda q: q[:1], "mass": [1.0, 1.0]} | given))
+    system = ji.System(
+        **({"gap_function": lambda q: q[:1], "mass": [1.0, 1.0]} | given)
+    )
     with pytest.raises((ValueError, TypeError), match=named):
         ji.simulate(system, ji.Moreau(0.5), [1.0, 0.0], [0.0, 0.0], 1.0, **options)
 
@@ -324,7 +360,9 @@ def test_functions_of_a_system_compute_in_the_precision_of_the_start(given, opti
     one = np.ones(1, np.float32)
     system = ji.System(**({"gap_function": lambda q: q, "mass": one} | given))
     name = next(iter(given))
-    with pytest.raises(TypeError, match=f"precision of `q0`, float32, but its `{name}` returns"):
+    with pytest.raises(
+        TypeError, match=f"precision of `q0`, float32, but its `{name}` returns"
+    ):
         ji.simulate(system, ji.Moreau(np.float32(0.5)), one, 0 * one, 1.0, **options)
 
 
@@ -338,7 +376,9 @@ def test_a_disc_without_walls_is_refused():
 def test_a_motion_is_in_the_widest_precision_given():
     """A start in single precision, of a body in double; whole forces."""
     system = ji.System(
-        lambda q: q[1:] - q[:-1] - 0.2, [1.0] * 3, force=lambda q, v, t: jnp.zeros(3, int)
+        lambda q: q[1:] - q[:-1] - 0.2,
+        [1.0] * 3,
+        force=lambda q, v, t: jnp.zeros(3, int),
     )
     start = np.array([0.0, 0.3, 0.6], np.float32), np.zeros(3, np.float32)
     with jax.numpy_dtype_promotion("standard"):
@@ -359,7 +399,17 @@ class Apart(ji.Body):
 LINE = (1.0, -1.0)
 
 
-PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of two; the third flies away much faster
+PLANE = (
+    1.0,
+    0.0,
+    0.0,
+    -1.0,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+)  # of two; the third flies away much faster
 
 
 DISCS = ji.Bodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
@@ -414,7 +464,9 @@ def slid_off(**options):
     )
     system = ji.System(bodies, gravity=True)
     law, start = ji.Moreau(0.3, friction=0.2), [0.0, 0.5, 0.0, 0.7, 1.1, 0.0]
-    return ji.simulate(system, law, start, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 2.0, **options)
+    return ji.simulate(
+        system, law, start, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 2.0, **options
+    )
 
 
 # Friction moves the middle of the normal forces forward by mu h / 2 = .02 m: the block topples as
@@ -429,16 +481,22 @@ def test_a_block_slides_off_a_table():
     time, (x, y, angle) = np.asarray(motion.time), np.asarray(motion.q)[:, 3:].T
     slides = time < TOPPLES - 0.005
     np.testing.assert_allclose(angle[slides], 0, atol=1e-6)
-    np.testing.assert_allclose(x[slides], (0.7 + 1.5 * time - 0.1 * G * time**2)[slides], atol=1e-6)
+    np.testing.assert_allclose(
+        x[slides], (0.7 + 1.5 * time - 0.1 * G * time**2)[slides], atol=1e-6
+    )
     assert (angle[(time > TOPPLES + 0.05) & (time < TOPPLES + 0.3)] < -1e-3).all()
     np.testing.assert_allclose([y[-1], angle[-1]], [0.1, 0.0], atol=1e-4)
     assert x[-1] > 1.2
-    assert float(np.nanmin(motion.gaps)) > -1e-2  # Moreau and Jean: h times the approach
+    assert (
+        float(np.nanmin(motion.gaps)) > -1e-2
+    )  # Moreau and Jean: h times the approach
 
 
 @pytest.mark.release
 def test_a_block_topples_off_a_table_at_its_moment():
     motion = ji.raise_on_failure(slid_off(samples=41))
-    assert float(motion.event_times("detachment")[0]) == pytest.approx(TOPPLES, abs=1e-7)
+    assert float(motion.event_times("detachment")[0]) == pytest.approx(
+        TOPPLES, abs=1e-7
+    )
     np.testing.assert_allclose(motion.q[-1, 4:], [0.1, 0.0], atol=1e-9)
     assert float(np.nanmin(motion.gaps)) > -1e-9

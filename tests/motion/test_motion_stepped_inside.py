@@ -44,7 +44,9 @@ def test_a_tossed_cube_makes_its_second_impact_where_it_was_measured():
         return np.array([float(row[f"{name}_{x}{tail}"]) for x in axes])
 
     def velocities(row):
-        return numbers(row, "v", "xyz", "_pre_m_s"), numbers(row, "omega", "xyz", "_pre_rad_s")
+        return numbers(row, "v", "xyz", "_pre_m_s"), numbers(
+            row, "omega", "xyz", "_pre_rad_s"
+        )
 
     cube = ji.Box(
         [0.102] * 3, mass=0.37, inertia=[9.57e-4, 9.57e-4, 9.09e-4], centre=[0, 0, 0.0057],
@@ -75,4 +77,6 @@ def test_a_tossed_cube_makes_its_second_impact_where_it_was_measured():
                 np.linalg.norm(turned - spin2) / np.linalg.norm(spin2),
             ]
         )
-    assert (np.median(misses, axis=0) < [0.1, 0.1, 0.2]).all(), np.median(misses, axis=0)
+    assert (np.median(misses, axis=0) < [0.1, 0.1, 0.2]).all(), np.median(
+        misses, axis=0
+    )

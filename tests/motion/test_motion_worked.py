@@ -20,7 +20,9 @@ def ended(motion):
     """Names of the statuses of a motion, or of a batch's."""
     lanes = [motion]
     if np.ndim(motion.status):
-        lanes = [jax.tree.map(lambda x, i=i: x[i], motion) for i in range(len(motion.status))]
+        lanes = [
+            jax.tree.map(lambda x, i=i: x[i], motion) for i in range(len(motion.status))
+        ]
     return [lane.to_dict()["status"] for lane in lanes]
 
 
@@ -32,7 +34,9 @@ def test_cradle_over_fifty_swings():
     law = ji.LZB(0.95, exponent=1.5)
 
     def swing():
-        return ji.simulate(system, law, [-0.3, 0, 0], [0.0] * 3, 50 * period, samples=1001)
+        return ji.simulate(
+            system, law, [-0.3, 0, 0], [0.0] * 3, 50 * period, samples=1001
+        )
 
     motion, again = swing(), swing()
     assert ended(motion) == ["ok"]
@@ -78,7 +82,9 @@ def test_free_rocking_to_rest():
     alpha, radius = np.arctan(1 / 3), np.hypot(0.1, 0.3)
     p = G * radius / (4 / 3 * radius**2)
 
-    def slowness(s, top):  # theta = top (1 - s^2) takes out the root at the turning point
+    def slowness(
+        s, top
+    ):  # theta = top (1 - s^2) takes out the root at the turning point
         theta = top * (1 - s * s)
         if s == 0:
             return np.sqrt(4 * top / (2 * p * np.sin(alpha - top)))
@@ -89,7 +95,11 @@ def test_free_rocking_to_rest():
     np.testing.assert_allclose(motion.events.time[0], first, atol=1e-8)
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
-    assert float(motion.events.time[last]) < float(motion.events.accumulation_end[last]) < 3
+    assert (
+        float(motion.events.time[last])
+        < float(motion.events.accumulation_end[last])
+        < 3
+    )
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
@@ -105,7 +115,9 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
         samples=61,
     )
     assert ended(motion) == ["ok"]
-    assert 100 < int(motion.events.count) < 200  # 496 if each contact came to rest for itself
+    assert (
+        100 < int(motion.events.count) < 200
+    )  # 496 if each contact came to rest for itself
     assert int(motion.steps) < 10 * int(motion.events.count)
     energy = np.asarray(motion.energy)
     assert np.diff(energy).max() < 1e-11 * energy[0]
@@ -135,7 +147,12 @@ def test_three_touching_beads_come_to_rest():
     assert ended(motion) == ended(fine) == ["ok"]
     assert last < 400 < 4 * last < late
     rest = float(fine.events.time[late])
-    assert motion.events.time[last] < rest < motion.events.accumulation_end[last] < rest + 0.01
+    assert (
+        motion.events.time[last]
+        < rest
+        < motion.events.accumulation_end[last]
+        < rest + 0.01
+    )
     for found in (motion, fine):
         np.testing.assert_allclose(found.q[-1], beads - 0.1, atol=1e-12)
         np.testing.assert_allclose(found.ledger_residual, 0, atol=1e-13)
@@ -175,7 +192,9 @@ def test_a_body_on_a_tilted_plane_slides():
     slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
     system = ji.System(slope, gravity=True, friction=0.25)
     rest = [0.0] * 3
-    motion = ji.simulate(system, ji.Moreau(0.0), slope.touching(), rest, 1.0, samples=11)
+    motion = ji.simulate(
+        system, ji.Moreau(0.0), slope.touching(), rest, 1.0, samples=11
+    )
     assert ended(motion) == ["ok"]
     way = np.linalg.norm(np.asarray(motion.q[-1] - motion.q[0])[:2])
     assert way == pytest.approx(0.5 * G * (np.sin(0.3) - 0.25 * np.cos(0.3)), rel=1e-12)
@@ -189,11 +208,18 @@ def test_overturning_on_a_harmonic_base():
     @jax.jit
     @jax.vmap
     def shake(acceleration):
-        base = ji.HarmonicBase(-acceleration * G / (4 * jnp.pi) ** 2, 2.0, jnp.pi / 2, "horizontal")
+        base = ji.HarmonicBase(
+            -acceleration * G / (4 * jnp.pi) ** 2, 2.0, jnp.pi / 2, "horizontal"
+        )
         start = base(jnp.zeros(()))[0]
         q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
         return ji.simulate(
-            ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base, friction=5.0),
+            ji.System(
+                ji.Block(0.2, 0.6, corners="base"),
+                gravity=True,
+                base=base,
+                friction=5.0,
+            ),
             law,
             q0,
             jnp.zeros(3),
@@ -201,7 +227,9 @@ def test_overturning_on_a_harmonic_base():
         )
 
     motion = shake(jnp.array([0.33, 0.36, 0.4, 0.6]))
-    still, trembles, rocks, falls = np.nanmax(np.abs(np.asarray(motion.q)[..., 2]), axis=1)
+    still, trembles, rocks, falls = np.nanmax(
+        np.abs(np.asarray(motion.q)[..., 2]), axis=1
+    )
     assert still < 1e-10
     # just above the threshold hops die out while the base shakes
     assert ended(motion)[1] == "ok"
@@ -217,7 +245,9 @@ def test_basketball_and_tennis_ball(law):
     e, v = 0.9, np.sqrt(2 * G)
 
     def rebound(light, gap):
-        system = ji.System(ji.Column(jnp.stack([0.6, light]), [0.12, 0.033]), gravity=True)
+        system = ji.System(
+            ji.Column(jnp.stack([0.6, light]), [0.12, 0.033]), gravity=True
+        )
         q0 = jnp.stack([jnp.full((), 1.12), 1.12 + 0.12 + 0.033 + gap])
         motion = ji.simulate(system, law, q0, jnp.zeros(2), 0.6, samples=13)
         return motion.events.velocity_after[:2], motion.status
@@ -250,9 +280,13 @@ def shaken(x):
 @pytest.mark.parametrize(
     ("given", "at", "events", "step", "allowed"),
     [
-        pytest.param(collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8, marks=pytest.mark.release),
+        pytest.param(
+            collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8, marks=pytest.mark.release
+        ),
         # the plate of 2 cm: differences see no more
-        pytest.param(shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.release),
+        pytest.param(
+            shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.release
+        ),
     ],
 )
 def test_derivatives_of_a_motion_against_differences(given, at, events, step, allowed):
@@ -263,7 +297,9 @@ def test_derivatives_of_a_motion_against_differences(given, at, events, step, al
         motion = ji.simulate(*given(x), samples=4, max_events=60, method=method)
         assert motion.events.time.shape == (60,)
         end = [motion.q[-1], motion.velocity[-1], motion.contact_work[-1].ravel()]
-        return jnp.concatenate([*end, motion.base_work[-1:], motion.events.time[:events]])
+        return jnp.concatenate(
+            [*end, motion.base_work[-1:], motion.events.time[:events]]
+        )
 
     x = jnp.array(at)
     if given is collides:  # the way back through a law's plan is another test's

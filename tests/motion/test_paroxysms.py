@@ -48,7 +48,14 @@ def test_its_outcome_is_the_limit_of_a_stiff_contact():
         stops.terminal, stops.direction = True, 1
         opens.terminal, opens.direction = True, -1
         y = np.array(
-            [0, np.sin(theta), theta, slip - np.sin(theta) * rate, np.cos(theta) * rate, rate]
+            [
+                0,
+                np.sin(theta),
+                theta,
+                slip - np.sin(theta) * rate,
+                np.cos(theta) * rate,
+                rate,
+            ]
         )
         for sticks, event in ((False, stops), (True, opens)):
             y = solve_ivp(
@@ -68,7 +75,9 @@ def test_its_derivatives(name):
     """Of the motion, along a direction of all that it starts with; its outcome is smooth."""
     given, along = jnp.array(STARTS[name]), jnp.array([0.0, 0.0, 0.2, 0.5, -0.4])
     slope = differentiated(given, along)[1]
-    ends = [differentiated(given + h * along, along)[0] for h in (1e-4, -1e-4, 1e-3, -1e-3)]
+    ends = [
+        differentiated(given + h * along, along)[0] for h in (1e-4, -1e-4, 1e-3, -1e-3)
+    ]
     fine, coarse = (ends[0] - ends[1]) / 2e-4, (ends[2] - ends[3]) / 2e-3
     assert np.abs(slope).max() > 0.01
     np.testing.assert_allclose(slope, fine + (fine - coarse) / 99, atol=1e-6)

@@ -57,7 +57,9 @@ def test_several_solutions_are_reported():
     assert motion.events.status[0] == CODE["several_outcomes"]
     np.testing.assert_allclose(motion.energy[-1], motion.energy[0], rtol=1e-12)
     np.testing.assert_allclose(  # it flies
-        motion.q[-1, 1], np.sin(0.7) + 5 * np.cos(0.7) * T_END - G * T_END**2 / 2, rtol=1e-9
+        motion.q[-1, 1],
+        np.sin(0.7) + 5 * np.cos(0.7) * T_END - G * T_END**2 / 2,
+        rtol=1e-9,
     )
 
 
@@ -81,7 +83,9 @@ def test_a_sliding_rod_jams():
         turn = 3 * press * (MU * s - c)
         return [room, room * rate, turn, MU * press + room * c * rate**2 + s * turn]
 
-    y = solve_ivp(field, (0, 20), [0, theta, rate, slip], "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    y = solve_ivp(
+        field, (0, 20), [0, theta, rate, slip], "DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
     status, kinds = reported("jamming")
     assert status == "ok"
     assert kinds[:2] == ["friction", "paroxysm"]

@@ -16,7 +16,10 @@ def packing():
     centres, radii = [], []
     while len(radii) < 480:
         c, r = 0.1 + 1.7 * rng.random(3), 0.05 * (1 + 0.1 * rng.random())
-        if all(np.linalg.norm(c - x) > 0.98 * (r + s) for x, s in zip(centres, radii, strict=True)):
+        if all(
+            np.linalg.norm(c - x) > 0.98 * (r + s)
+            for x, s in zip(centres, radii, strict=True)
+        ):
             centres.append(c)
             radii.append(r)
     walls = [[2.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 3.0, 4.0, 0.0]]
@@ -41,7 +44,10 @@ def test_closed_contacts_are_those_with_small_gaps(packing):
     k, walls = spheres.count, len(spheres.planes)
     i, j = np.triu_indices(k, 1)
     numbers = np.concatenate(
-        [(np.arange(k) * (k + walls) + k + np.arange(walls)[:, None]).ravel(), i * (k + walls) + j]
+        [
+            (np.arange(k) * (k + walls) + k + np.arange(walls)[:, None]).ravel(),
+            i * (k + walls) + j,
+        ]
     )
     least = np.minimum(spheres.gap_function(q), spheres.gap_function(later))
     expected = numbers[least <= 0.01]
@@ -57,7 +63,9 @@ def test_pairs_that_meet_within_a_step_may_be_two_cells_apart():
     later = q + discs.at([[0.2 * (-1) ** i, 0.0] for i in range(80)])
     pairs = contacts(discs, q, later)
     expected = [[i, i + 1] for i in range(0, 80, 2)]
-    assert sorted(np.asarray(pairs.bodies)[np.asarray(pairs.closed)].tolist()) == expected
+    assert (
+        sorted(np.asarray(pairs.bodies)[np.asarray(pairs.closed)].tolist()) == expected
+    )
 
 
 @pytest.mark.slow
@@ -68,7 +76,10 @@ def test_directions_are_velocities_of_the_points_that_touch(packing):
     closed = np.asarray(pairs.closed)
     rng = np.random.default_rng(2)
     v = np.concatenate([rng.standard_normal((spheres.count, 6)), np.zeros((1, 6))])
-    bodies, directions = np.asarray(pairs.bodies)[closed], np.asarray(pairs.directions)[closed]
+    bodies, directions = (
+        np.asarray(pairs.bodies)[closed],
+        np.asarray(pairs.directions)[closed],
+    )
     rates = np.einsum("kdbx,kbx->kd", directions, v[bodies])
     at = np.asarray(q).reshape(-1, 6)[:, :3]
     radii = np.append(np.asarray(spheres.rims), 0.0)
@@ -78,9 +89,13 @@ def test_directions_are_velocities_of_the_points_that_touch(packing):
         n, half = way[0, 0, :3], 0.0
         if b < spheres.count:
             half = 0.5 * (np.linalg.norm(at[a] - at[b]) - radii[a] - radii[b])
-            np.testing.assert_allclose(n, (at[a] - at[b]) / np.linalg.norm(at[a] - at[b]))
+            np.testing.assert_allclose(
+                n, (at[a] - at[b]) / np.linalg.norm(at[a] - at[b])
+            )
         else:
-            wall = np.asarray(spheres.planes)[number % (spheres.count + 3) - spheres.count]
+            wall = np.asarray(spheres.planes)[
+                number % (spheres.count + 3) - spheres.count
+            ]
             np.testing.assert_array_equal(n, wall[:3])
         point = v[a, :3] - (radii[a] + half) * np.cross(v[a, 3:], n)
         point -= v[b, :3] + (radii[b] + half) * np.cross(v[b, 3:], n)
@@ -88,13 +103,17 @@ def test_directions_are_velocities_of_the_points_that_touch(packing):
         np.testing.assert_allclose(
             np.stack([n, t1, t2]) @ np.stack([n, t1, t2]).T, np.eye(3), atol=1e-15
         )
-        np.testing.assert_allclose(found, [point @ n, point @ t1, point @ t2], atol=1e-14)
+        np.testing.assert_allclose(
+            found, [point @ n, point @ t1, point @ t2], atol=1e-14
+        )
 
 
 def test_spheres_are_a_body_like_others():
     """Gradients of gaps and tangents are those of the closed contacts; mass by 2 m R^2 / 5."""
     spheres = piles.spheres([1.0, 2.0], [0.1, 0.2], planes=[[0.0, 0.0, 1.0, 0.0]])
-    np.testing.assert_allclose(spheres.mass, [1] * 3 + [0.004] * 3 + [2] * 3 + [0.032] * 3)
+    np.testing.assert_allclose(
+        spheres.mass, [1] * 3 + [0.004] * 3 + [2] * 3 + [0.032] * 3
+    )
     q = spheres.at([[0.0, 0.0, 0.1], [0.0, np.sqrt(0.08), 0.2]])
     gradients, tangents, pairs = jax.jit(
         lambda q: (
@@ -103,8 +122,15 @@ def test_spheres_are_a_body_like_others():
             spheres.active_pairs(q, q, jnp.asarray(1e-12)),
         )
     )(q)
-    assert np.asarray(pairs.number)[:3].tolist() == [1, 2, 5]  # 3 i + j, j = 2 is the wall
-    each = np.asarray(gradients).reshape(3, 1, 2, 6), np.asarray(tangents).T.reshape(3, 2, 2, 6)
+    assert np.asarray(pairs.number)[:3].tolist() == [
+        1,
+        2,
+        5,
+    ]  # 3 i + j, j = 2 is the wall
+    each = (
+        np.asarray(gradients).reshape(3, 1, 2, 6),
+        np.asarray(tangents).T.reshape(3, 2, 2, 6),
+    )
     expected = np.concatenate(each, axis=1)[[2, 0, 1]]  # planes come first
     for row in range(3):
         for side, body in enumerate(np.asarray(pairs.bodies)[row]):
@@ -197,9 +223,14 @@ def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
     ours, theirs = (jax.tree.map(np.asarray, parts(body, q)) for body in (pile, every))
     order, expected = np.argsort(ours[0]), np.argsort(theirs[0])
     np.testing.assert_allclose(ours[0][order], theirs[0][expected], atol=1e-14)
-    for found, right, signs in ((ours[1], theirs[1], (1,)), (ours[2], theirs[2], (1, -1))):
+    for found, right, signs in (
+        (ours[1], theirs[1], (1,)),
+        (ours[2], theirs[2], (1, -1)),
+    ):
         found, right = found[:, order], right[:, expected]
-        off = np.min([np.abs(found - sign * right).max(axis=0) for sign in signs], axis=0)
+        off = np.min(
+            [np.abs(found - sign * right).max(axis=0) for sign in signs], axis=0
+        )
         np.testing.assert_allclose(off, 0, atol=1e-14)
 
 
@@ -230,11 +261,15 @@ def test_a_mixed_pile_finds_its_contacts_by_the_grid():
     assert least == gaps[0].min() < 0.2
     assert apart == pytest.approx(0.9)  # none are near each other, or the wall
     directions = np.asarray(pairs.directions)[: int(pairs.filled)]
-    np.testing.assert_allclose(np.linalg.norm(directions[:, :, 0, :2], axis=2), 1, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(directions[:, :, 0, :2], axis=2), 1, rtol=1e-12
+    )
 
 
 def test_bad_mixed_piles_are_named():
-    with pytest.raises(TypeError, match=r"`bodies` must be discs, polygons or spheres, not Dimer"):
+    with pytest.raises(
+        TypeError, match=r"`bodies` must be discs, polygons or spheres, not Dimer"
+    ):
         ji.Bodies([ji.Dimer(0.1, 0.5)], room=9)
     with pytest.raises(ValueError, match="`bodies` must hold one or more"):
         ji.Bodies([], room=9)
@@ -251,22 +286,35 @@ def test_a_mixed_pile_comes_to_rest_and_goes_on():
         ji.Polygon([[0, 0], [0.2, 0], [0.1, 0.1]]),
     ]
     pile = ji.Bodies(
-        bodies * 2, room=12 * len(bodies), planes=[[0, 1.0, 0], [1.0, 0, -0.25], [-1.0, 0, -0.25]]
+        bodies * 2,
+        room=12 * len(bodies),
+        planes=[[0, 1.0, 0], [1.0, 0, -0.25], [-1.0, 0, -0.25]],
     )
     system, law = ji.System(pile, gravity=10.0), ji.Moreau(0.0, friction=0.5)
-    places = [[-0.1, 0.06], [0.13, 0.07], [0.0, 0.2], [-0.1, 0.32], [0.13, 0.3], [0.0, 0.45]]
+    places = [
+        [-0.1, 0.06],
+        [0.13, 0.07],
+        [0.0, 0.2],
+        [-0.1, 0.32],
+        [0.13, 0.3],
+        [0.0, 0.45],
+    ]
     options = dict(samples=5, method="time_stepping", step=1e-3)
     motion = ji.simulate(system, law, pile.at(places), np.zeros(18), 1.5, **options)
     ji.raise_on_failure(motion)
     assert motion.kinetic_energy[-1] < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
-    assert -2e-3 < float(motion.gaps.min()) < -1e-9  # steps leave overlaps, with which it goes on
+    assert (
+        -2e-3 < float(motion.gaps.min()) < -1e-9
+    )  # steps leave overlaps, with which it goes on
     later = ji.simulate(system, law, **motion.restart(1.7), **options)
     np.testing.assert_allclose(later.q[-1], motion.q[-1], atol=1e-6)
     at = ji.TimeStepping(1e-3).contacts(system, law, motion.q[-1], motion.velocity[-1])
     # everything that the walls give carries the weight
     push = at.impulse[:, None] * at.normals + at.tangential
-    np.testing.assert_allclose(push[at.bodies[:, 1] < 0].sum(axis=0) / 1e-3, [0, 80], atol=1e-2)
+    np.testing.assert_allclose(
+        push[at.bodies[:, 1] < 0].sum(axis=0) / 1e-3, [0, 80], atol=1e-2
+    )
 
 
 @pytest.fixture(scope="module")
@@ -276,7 +324,12 @@ def struck():
     Four more make it too many contacts for the program that small scenes share.
     """
     h = np.sqrt(3)
-    places = [[0, 0, 1.0], [h, 1.0, 1.0], [h, -1.0, 1.0], *([9.0 * i, 0, 1.0] for i in range(1, 6))]
+    places = [
+        [0, 0, 1.0],
+        [h, 1.0, 1.0],
+        [h, -1.0, 1.0],
+        *([9.0 * i, 0, 1.0] for i in range(1, 6)),
+    ]
     spheres = piles.spheres(
         [1.0, 1.0, 1.0, 2.0] + 4 * [1.0], [1.0] * 8, planes=[[0.0, 0.0, 2.0, 0.0]]
     )
@@ -288,7 +341,11 @@ def struck():
 @pytest.mark.slow
 def test_a_packing_has_the_contacts_of_its_body(struck):
     spheres, q, _ = struck
-    scene, places, columns = spheres.closed_scene(q), np.asarray(q).reshape(8, 6)[:, :3], []
+    scene, places, columns = (
+        spheres.closed_scene(q),
+        np.asarray(q).reshape(8, 6)[:, :3],
+        [],
+    )
     for i, j in [(0, 1), (0, 2), (1, 2)]:
         column = np.zeros((8, 6))
         column[i, :3] = (places[i] - places[j]) / 2
@@ -304,14 +361,18 @@ def test_a_packing_has_the_contacts_of_its_body(struck):
     x = np.arange(11.0)
     np.testing.assert_allclose(sparse @ x, w @ x, atol=1e-14)
     np.testing.assert_allclose(ji.gap_velocity(scene, q), normals.T @ q, atol=1e-13)
-    np.testing.assert_allclose(ji.velocity_change(scene, x), normals @ x / spheres.mass, atol=1e-14)
+    np.testing.assert_allclose(
+        ji.velocity_change(scene, x), normals @ x / spheres.mass, atol=1e-14
+    )
 
 
 def test_a_packing_is_struck(struck):
     """p (2 + cos 60) = (1 + e) cos 30, and contact 2, 3 opens. v+ is linear in v-: so its derivative."""
     spheres, q, v = struck
     scene, e = spheres.closed_scene(q), 0.5
-    after, rate = jax.jvp(lambda v: ji.impact(ji.Moreau(e), scene, v).velocity, (v,), (v,))
+    after, rate = jax.jvp(
+        lambda v: ji.impact(ji.Moreau(e), scene, v).velocity, (v,), (v,)
+    )
     p = (1 + e) * np.sqrt(0.75) / 2.5
     expected = np.zeros(48)
     expected[0] = 1 - 2 * p * np.sqrt(0.75)
@@ -343,7 +404,9 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
     np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
     column = ji.System(ji.Column([1.0]), gravity=True)
-    with pytest.raises(ValueError, match=r"must be of a body with many contacts .* of Column"):
+    with pytest.raises(
+        ValueError, match=r"must be of a body with many contacts .* of Column"
+    ):
         steps.contacts(column, ji.Moreau(0.5), [0.0], [-1.0])
     with pytest.raises(ValueError, match="must lead to a contact within the step"):
         steps.contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v)
@@ -382,5 +445,7 @@ def test_piles_by_events_are_refused_with_friction():
     at = pile.at([[0.0, 0.0], [0.3, 0.0]])
     law = ji.Compliant(ji.Hertz(1e6), friction=0.1)
     for method in ("events", "contact_forces"):
-        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of Bodies"):
+        with pytest.raises(
+            ValueError, match="`friction` must be 0 for the contacts of Bodies"
+        ):
             ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)

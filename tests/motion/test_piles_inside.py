@@ -24,14 +24,19 @@ def test_the_grid_meets_every_near_pair_once(d):
     pairs_of = jax.jit(lambda points, distance: near_pairs(points, distance, 60))
     clouds = (
         3 * rng.random((90, d)),
-        np.concatenate([rng.random((60, d)), 1e7 * rng.standard_normal((30, d))]),  # some flew away
-        0.25 * rng.integers(0, 6, (90, d)) + 1e-13 * rng.random((90, d)),  # on borders of cells
+        np.concatenate(
+            [rng.random((60, d)), 1e7 * rng.standard_normal((30, d))]
+        ),  # some flew away
+        0.25 * rng.integers(0, 6, (90, d))
+        + 1e-13 * rng.random((90, d)),  # on borders of cells
     )
     for points in clouds:
         for distance in (0.25, 0.6):
             pairs = pairs_of(points, distance)
             used = np.asarray(pairs.used)
-            first, second = (np.asarray(x)[used].tolist() for x in (pairs.first, pairs.second))
+            first, second = (
+                np.asarray(x)[used].tolist() for x in (pairs.first, pairs.second)
+            )
             met = list(zip(first, second, strict=True))
             assert len(met) == len(set(met))
             assert brute_force(points, distance) <= set(met)
@@ -50,13 +55,17 @@ def test_a_crowd_holds_the_densest_packing():
     rng = np.random.default_rng(0)
     i, j, k = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-6, 7)] * 3))
     layer = np.unique(np.stack([i + j / 2, np.sqrt(0.75) * j], axis=1), axis=0)
-    ball = np.stack([i + j / 2 + k / 2, np.sqrt(0.75) * (j + k / 3), np.sqrt(2 / 3) * k], axis=1)
+    ball = np.stack(
+        [i + j / 2 + k / 2, np.sqrt(0.75) * (j + k / 3), np.sqrt(2 / 3) * k], axis=1
+    )
     for points, d in ((layer, 2), (ball, 3)):  # spacing 1, cells of 1 or 2
         for ratio in (1, 2):
             most = 0
             for corner in rng.random((400, d)):
                 size = np.array([ratio] * (d - 1) + [3 * ratio], float)
-                inside = np.all((points >= corner - 2) & (points < corner - 2 + size), axis=1)
+                inside = np.all(
+                    (points >= corner - 2) & (points < corner - 2 + size), axis=1
+                )
                 most = max(most, int(inside.sum()))
             assert 2 < most <= crowd_of(0.5, 0.5 * ratio, d)
 
@@ -70,4 +79,6 @@ def test_piles_of_many_contacts_warn_by_events():
         start_by(as_method("time_stepping", 0.1), *arguments)
         with warnings.catch_warnings(record=True) as said:
             start_by(as_method("events"), *arguments)
-        assert ["compiles for minutes" in str(x.message) for x in said] == [True] * warns
+        assert ["compiles for minutes" in str(x.message) for x in said] == [
+            True
+        ] * warns

@@ -22,7 +22,10 @@ from jimpact import (
 
 GAPS = Block(1.0, 1.0).gap_function
 MASS = jnp.array([1.0, 1.0, 1 / 6])
-FLAT, LANDING = jnp.array([0.0, 0.5, 0.0]), jnp.array([0.0, -0.5, -1.0])  # gap rates (-1, 0)
+FLAT, LANDING = (
+    jnp.array([0.0, 0.5, 0.0]),
+    jnp.array([0.0, -0.5, -1.0]),
+)  # gap rates (-1, 0)
 
 
 class Turned(NamedTuple):
@@ -48,9 +51,13 @@ def turning_impact(gaps, mass, q, v, force):
 @pytest.mark.parametrize(("force", "power"), [(LinearSpring, 1 / 2), (Hertz, 2 / 5)])
 def test_frozen_geometry_is_the_stiff_limit(force, power):
     """The error of frozen geometry is of the order of indentation over size: k^(-1/(eta+1))."""
-    moving = [turning_impact(GAPS, MASS, FLAT, LANDING, force(k)) for k in (1e6, 1e8, 1e10)]
+    moving = [
+        turning_impact(GAPS, MASS, FLAT, LANDING, force(k)) for k in (1e6, 1e8, 1e10)
+    ]
     assert all(bool(out.ended) for out in moving)
-    frozen = impact(Compliant(force(1.0)), scene_from_gaps(GAPS, MASS, FLAT), LANDING).velocity
+    frozen = impact(
+        Compliant(force(1.0)), scene_from_gaps(GAPS, MASS, FLAT), LANDING
+    ).velocity
     error = [float(jnp.abs(out.velocity - frozen).max()) for out in moving]
     assert error[1] / error[0] == pytest.approx(100**-power, rel=0.02)
     assert error[2] / error[1] == pytest.approx(100**-power, rel=0.02)
@@ -78,7 +85,9 @@ def test_block_on_one_corner():
 def test_straight_chain_does_not_turn(force):
     gaps = jnp.array([0.0, 0.2])
     v = jnp.array([1.0, 0.0, 0.0])
-    out = turning_impact(lambda q: jnp.diff(q), jnp.ones(3), jnp.array([0.0, 0.0, 0.2]), v, force)
+    out = turning_impact(
+        lambda q: jnp.diff(q), jnp.ones(3), jnp.array([0.0, 0.0, 0.2]), v, force
+    )
     wanted = impact(Compliant(force), chain(jnp.ones(3), gaps=gaps), v).velocity
     np.testing.assert_allclose(out.velocity, wanted, atol=1e-6)
     assert bool(out.ended)
@@ -104,9 +113,13 @@ def test_mass_that_depends_on_the_configuration():
         lambda q: q[1:] - 0.6, jnp.ones(2), jnp.array([0.8, 0.6]), turn @ v, soft
     )
     r, phi = polar.position
-    end = jnp.array([[jnp.cos(phi), -r * jnp.sin(phi)], [jnp.sin(phi), r * jnp.cos(phi)]])
+    end = jnp.array(
+        [[jnp.cos(phi), -r * jnp.sin(phi)], [jnp.sin(phi), r * jnp.cos(phi)]]
+    )
     np.testing.assert_allclose(end @ polar.velocity, cartesian.velocity, atol=1e-7)
-    assert float(cartesian.velocity[1]) == pytest.approx(-float((turn @ v)[1]), abs=1e-7)
+    assert float(cartesian.velocity[1]) == pytest.approx(
+        -float((turn @ v)[1]), abs=1e-7
+    )
 
 
 @pytest.mark.release
@@ -128,6 +141,8 @@ def test_derivative():
 
 @pytest.mark.slow
 def test_nothing_approaches():
-    out = turning_impact(GAPS, MASS, FLAT, -LANDING, Hertz(1e6))  # a corner at rest opens at once
+    out = turning_impact(
+        GAPS, MASS, FLAT, -LANDING, Hertz(1e6)
+    )  # a corner at rest opens at once
     assert bool(out.ended)
     np.testing.assert_allclose(out.velocity, -LANDING, atol=1e-12)

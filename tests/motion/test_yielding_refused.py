@@ -7,9 +7,17 @@ import jimpact as ji
 
 def test_what_motions_and_calibration_refuse():
     force = ji.ElastoPlastic(1.0, 0.2)
-    with pytest.raises(TypeError, match=r"`law` must have a force without bound in a motion"):
+    with pytest.raises(
+        TypeError, match=r"`law` must have a force without bound in a motion"
+    ):
         ji.simulate(
-            *(ji.System(ji.Column([1.0]), gravity=True), ji.Compliant(force), [1.0], [0.0], 1.0),
+            *(
+                ji.System(ji.Column([1.0]), gravity=True),
+                ji.Compliant(force),
+                [1.0],
+                [0.0],
+                1.0,
+            ),
             method="contact_forces",
         )
     with pytest.raises(TypeError, match="`force` must have a damping"):

@@ -14,7 +14,9 @@ MATRIX[0, 0] = 0.0  # no pivot without an exchange of rows
 
 def test_solution_and_determinant_with_their_derivatives():
     """`dx = -K^-1 dK x` and `d det K = det K tr(K^-1 dK)`; rounding grows with the condition."""
-    (x, size), (dx, rate) = jax.jvp(lambda k: solve_by_pivots(k, RIGHT), (MATRIX,), (CHANGE,))
+    (x, size), (dx, rate) = jax.jvp(
+        lambda k: solve_by_pivots(k, RIGHT), (MATRIX,), (CHANGE,)
+    )
     inverse, det = np.linalg.inv(MATRIX), np.linalg.det(MATRIX)
     np.testing.assert_allclose(x, inverse @ RIGHT, rtol=1e-12)
     np.testing.assert_allclose(size, det, rtol=1e-12)

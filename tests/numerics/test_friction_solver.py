@@ -29,7 +29,10 @@ def test_three_solutions_of_moreau():
 def test_a_spinning_cube_flat_on_four_corners_has_several_outcomes():
     """How the corners share p decides how friction turns it: the order of the contacts, else."""
     corners = np.array([[x, y, -0.5] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
-    way = [np.concatenate([np.tile(d, (4, 1)), np.cross(corners, d)], axis=1) for d in np.eye(3)]
+    way = [
+        np.concatenate([np.tile(d, (4, 1)), np.cross(corners, d)], axis=1)
+        for d in np.eye(3)
+    ]
     tangents = np.stack(way[:2], axis=1).reshape(8, 6).T
     cube = ji.Scene([1.0] * 3 + [1 / 6] * 3, way[2].T, tangents=tangents)
     v = {

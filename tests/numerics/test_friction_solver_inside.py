@@ -128,7 +128,9 @@ def outcomes(a, normal, slip, mu, complementary):
     return found
 
 
-@pytest.mark.parametrize("complementary", [pytest.param(True, marks=pytest.mark.release), False])
+@pytest.mark.parametrize(
+    "complementary", [pytest.param(True, marks=pytest.mark.release), False]
+)
 def test_planar_outcomes_are_those_of_brute_force(complementary):
     seen = {"several_outcomes": 0, "ok": 0, "infeasible": 0}
     rng = np.random.default_rng(2)
@@ -143,7 +145,10 @@ def test_planar_outcomes_are_those_of_brute_force(complementary):
         seen[expected] += 1
         if all_of_them:
             own = w[i][np.r_[:m, PLANAR : PLANAR + m]]
-            assert min(np.abs(own - one).max() for one in all_of_them) <= 1e-11 * np.abs(x[i]).max()
+            assert (
+                min(np.abs(own - one).max() for one in all_of_them)
+                <= 1e-11 * np.abs(x[i]).max()
+            )
     assert seen["several_outcomes"] >= 3
 
 
@@ -157,18 +162,24 @@ def misfit(lanes, found, rows, complementary):
     normal = np.abs(np.minimum(p, r) if complementary else r)
     outside = np.linalg.norm(side, axis=2) - bound
     power = np.abs(bound * np.linalg.norm(slip, axis=2) + np.sum(side * slip, axis=2))
-    return np.maximum(np.maximum(normal, outside), power).max(axis=1) / (1 + np.abs(x).max(axis=1))
+    return np.maximum(np.maximum(normal, outside), power).max(axis=1) / (
+        1 + np.abs(x).max(axis=1)
+    )
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("complementary", [True, pytest.param(False, marks=pytest.mark.release)])
+@pytest.mark.parametrize(
+    "complementary", [True, pytest.param(False, marks=pytest.mark.release)]
+)
 def test_spatial_outcomes_satisfy_the_law(complementary):
     lanes = random_scenes(2)
     found = ASK[2, complementary](*lanes)
     solved = np.asarray(found.status) <= CODE["several_outcomes"]
     assert solved.mean() > 0.98
     assert misfit(lanes, found, 2, complementary)[solved].max() < 1e-10
-    side = np.linalg.norm(np.asarray(found.tangential).reshape(LANES, SPATIAL, 2), axis=2)
+    side = np.linalg.norm(
+        np.asarray(found.tangential).reshape(LANES, SPATIAL, 2), axis=2
+    )
     sticks = (side < 0.99 * lanes[3] * found.normal).sum()
     assert 20 < sticks < LANES  # both modes are there
 
@@ -196,7 +207,9 @@ def test_a_block_lying_flat_shares_by_its_load():
         hold = 0.5 * loads.sum(axis=1)  # with mu = 1 half of what friction could
         for load, push in zip(loads, hold, strict=True):
             side = np.kron(np.ones((2, 2)), np.eye(rows))
-            a = np.block([[np.eye(2), np.zeros((2, 2 * rows))], [np.zeros((2 * rows, 2)), side]])
+            a = np.block(
+                [[np.eye(2), np.zeros((2, 2 * rows))], [np.zeros((2 * rows, 2)), side]]
+            )
             scenes.append((a, -load, -push * np.tile(np.eye(rows)[0], 2), np.ones(2)))
         found = ASK[rows, True](*padded(rows, scenes))
         assert (np.asarray(found.status) == CODE["impulse_not_unique"]).all()
@@ -226,8 +239,12 @@ def test_redundant_supports_press_least():
 
 def nearly_flat(i):
     """A, (a, b) and mu of four corners, contact by contact, and of a fifth that takes no part."""
-    mass, normals, tangents, velocity, e, mu = (x[i] for x in random_boxes("nearly flat", i + 1))
-    ways = np.concatenate([normals[:, :, None], tangents.reshape(6, 4, 2)], axis=2).reshape(6, 12)
+    mass, normals, tangents, velocity, e, mu = (
+        x[i] for x in random_boxes("nearly flat", i + 1)
+    )
+    ways = np.concatenate(
+        [normals[:, :, None], tangents.reshape(6, 4, 2)], axis=2
+    ).reshape(6, 12)
     speed = (ways.T @ velocity).reshape(4, 3) * [1 + e, 1, 1]
     a = ways.T @ np.linalg.solve(mass, ways)
     whole = np.eye(15)
@@ -320,7 +337,13 @@ def test_dense_solves_are_those_of_numpy(n):
     def run(k, right, singular, held):
         one = dense.solve_definite(k[..., 0], right[..., 0])
         pseudo = dense.pseudoinverse(singular, held)
-        return dense.solve(k, right), dense.inverse(k), dense.product(k, right), one, pseudo
+        return (
+            dense.solve(k, right),
+            dense.inverse(k),
+            dense.product(k, right),
+            one,
+            pseudo,
+        )
 
     x, inverse, product, one, pseudo = run(k, right, singular, held)
     for i in each:
@@ -328,7 +351,9 @@ def test_dense_solves_are_those_of_numpy(n):
         close(inverse[..., i] @ k[..., i], np.eye(n), atol=1e-10)
         close(product[..., i], k[..., i] @ right[..., i], atol=1e-12)
         matrix = singular[..., i] * np.outer(held[:, i], held[:, i])
-        close(matrix @ pseudo[..., i] @ matrix, matrix, atol=1e-6)  # what velocities depend on
+        close(
+            matrix @ pseudo[..., i] @ matrix, matrix, atol=1e-6
+        )  # what velocities depend on
         # the shares of redundant forces are the least ones to some percent: a null space of
         # rounding is divided by its root
         least = np.linalg.pinv(matrix, rcond=1e-9) @ matrix

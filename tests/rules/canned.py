@@ -56,7 +56,9 @@ def canned(shots, value=(0.6, 2.0), **change):
             "The data cannot see stiffness[1]: no measured velocity depends on it.",
         ),
     }
-    change = {f"known_{x}" if x in ("findings", "profiles") else x: change[x] for x in change}
+    change = {
+        f"known_{x}" if x in ("findings", "profiles") else x: change[x] for x in change
+    }
     for part in (search, errors):
         part |= {name: change.pop(name) for name in part if name in change}
     parts = {"search": Solution(**search), "errors": Uncertainty(**errors)}
@@ -85,7 +87,9 @@ def rocked(base=None):
         "velocity_before": before,
         "velocity_after": after,
     }
-    events = with_row(no_events(4, jnp.asarray(q[0]), jnp.asarray(before), 2), jnp.array(True), row)
+    events = with_row(
+        no_events(4, jnp.asarray(q[0]), jnp.asarray(before), 2), jnp.array(True), row
+    )
     work = np.zeros((6, 2, 2))
     work[3:, 0, 0] = -0.5
     record = Motion(
@@ -100,7 +104,15 @@ def impact_history():
     rows = np.sin(np.pi * t) * np.array([1.0, 0.5])
     none = np.zeros((9, 0))
     return History(
-        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, 0.6 * rows + 0.4 * t),
+        *(
+            37e-6 * t[:, 0],
+            900 * rows,
+            rows,
+            0.5 * rows**2,
+            rows,
+            rows - 0.5,
+            0.6 * rows + 0.4 * t,
+        ),
         np.zeros((9, 3)),
         *(none, none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
     )

@@ -46,7 +46,9 @@ def check_fields(kind):
     make, shapes = kind.__new__, {}
     for name, hint in typing.get_type_hints(kind).items():
         either = [x for x in (hint, *typing.get_args(hint)) if inspect.isclass(x)]
-        shapes[name] = tuple(x for x in either if issubclass(x, jaxtyping.AbstractArray))
+        shapes[name] = tuple(
+            x for x in either if issubclass(x, jaxtyping.AbstractArray)
+        )
 
     def checked(cls, *args, **kwargs):
         made = make(cls, *args, **kwargs)
@@ -54,7 +56,9 @@ def check_fields(kind):
             with jaxtyping.jaxtyped("context"):
                 for name, value in made._asdict().items():
                     if shapes[name] and isinstance(value, jax.Array):
-                        assert isinstance(value, shapes[name]), f"{kind.__name__}.{name}: {value}"
+                        assert isinstance(value, shapes[name]), (
+                            f"{kind.__name__}.{name}: {value}"
+                        )
         return made
 
     kind.__new__ = checked
@@ -72,7 +76,9 @@ def pressed(name):
 def pile():
     """Three discs in a row, of many bodies: their Delassus matrix is sparse."""
     discs = piles.discs([1.0, 2.0, 1.5], [0.1, 0.1, 0.1])
-    return discs.scene(jnp.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.4, 0.0, 0.0])), jnp.eye(9)[0]
+    return discs.scene(
+        jnp.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.4, 0.0, 0.0])
+    ), jnp.eye(9)[0]
 
 
 CHAIN, V = ji.chain([1.0, 2.0, 1.0]), jnp.array([1.0, 0.2, 0.0])
@@ -85,14 +91,25 @@ EDGE, CORNERS, PILE = pressed("edge"), pressed("flat"), pile()
 IMPACTS = {
     "lzb": (lambda e: ji.LZB(e, 1.0, 1.5), CHAIN, V),
     "lzb exponents": (lambda e: ji.LZB(0.5, 1.0, 1 + e * jnp.ones(2)), CHAIN, V),
-    "lzb conditioning": (lambda e: ji.LZB(e, 1.0, 1.5, check_conditioning=True), CHAIN, V),
+    "lzb conditioning": (
+        lambda e: ji.LZB(e, 1.0, 1.5, check_conditioning=True),
+        CHAIN,
+        V,
+    ),
     "lzb long chain": (lambda e: ji.LZB(e, 1.0, 1.5), *LONG),
     "lzb pile": (lambda e: ji.LZB(e, 1.0, 1.5), *PILE),
     "lzb plane": (lambda e: ji.LZB(e, 1.0, 1.5, friction=0.3), *PLANE),
     "lzb space": (lambda e: ji.LZB(e, 1.0, 1.5, friction=0.3, method="time"), *EDGE),
-    "lzb implicit": (lambda e: ji.LZB(e, 1.0, 1.5, friction=0.3, method="implicit"), *EDGE),
+    "lzb implicit": (
+        lambda e: ji.LZB(e, 1.0, 1.5, friction=0.3, method="implicit"),
+        *EDGE,
+    ),
     "gaps": (lambda e: ji.Compliant(ji.Bistiffness(1.0, 1.5, e)), GAPS, V),
-    "gaps implicit": (lambda e: ji.Compliant(ji.KelvinVoigt(2.0, e), method="implicit"), GAPS, V),
+    "gaps implicit": (
+        lambda e: ji.Compliant(ji.KelvinVoigt(2.0, e), method="implicit"),
+        GAPS,
+        V,
+    ),
     "viscous": (lambda e: ji.Compliant(ji.KelvinVoigt(2.0, e)), GAPS, V),
     "newton pile": (lambda e: ji.Newton(e), *PILE),
     "moreau": (lambda e: ji.Moreau(e), CHAIN, V),
@@ -120,7 +137,9 @@ def reverse_mode(scene, v, **options):
     """Reverse derivatives of a loop that keeps states."""
 
     def velocity(e):
-        return ji.impact(ji.LZB(e, 1.0, 1.5, adjoint="checkpoints", **options), scene, v).velocity
+        return ji.impact(
+            ji.LZB(e, 1.0, 1.5, adjoint="checkpoints", **options), scene, v
+        ).velocity
 
     return jax.jacrev(velocity)
 
@@ -141,8 +160,14 @@ def springs_back(e):
 
 CASES = {
     **{name: after(name) for name in IMPACTS},
-    **{f"grad {name}": jax.jacrev(after(name)) for name in ("lzb", "lzb plane", "lzb space")},
-    **{f"grad {name}": jax.jacrev(after(name)) for name in ("lzb implicit", "gaps", "moreau")},
+    **{
+        f"grad {name}": jax.jacrev(after(name))
+        for name in ("lzb", "lzb plane", "lzb space")
+    },
+    **{
+        f"grad {name}": jax.jacrev(after(name))
+        for name in ("lzb implicit", "gaps", "moreau")
+    },
     "grad moreau space": jax.jacrev(after("moreau space")),
     "hessian": jax.hessian(after("moreau plane")),
     "checkpoints": reverse_mode(CHAIN, V),

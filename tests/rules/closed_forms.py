@@ -33,7 +33,10 @@ class System:
     def arguments(self):
         state = self.state()
         m = state.size[1]
-        per = [np.broadcast_to(np.asarray(x, float), m) for x in (state.e, state.k, state.eta)]
+        per = [
+            np.broadcast_to(np.asarray(x, float), m)
+            for x in (state.e, state.k, state.eta)
+        ]
         return np.asarray(state.velocity, float), *per
 
     def outcome(self):
@@ -102,7 +105,9 @@ class RightAngles(System):
 
     def state(self):
         normals = np.array([[1.0, 0], [0, 1], [0, 0]])
-        return State(np.diag([1.0, 2, 3]), normals, [-1.0, -0.4, 0.3], e=[0.8, 0.5], k=[1, 30.0])
+        return State(
+            np.diag([1.0, 2, 3]), normals, [-1.0, -0.4, 0.3], e=[0.8, 0.5], k=[1, 30.0]
+        )
 
     def after(self, v, e, k, eta):
         return np.concatenate([-e * v[:2], v[2:]])
@@ -124,7 +129,16 @@ class HeadOn(System):
 class Plastic(System):
     """e = 0, all contacts approach: the common velocity sum m v / sum m."""
 
-    laws = ("newton", "moreau", "poisson", "matrix", "routh", "lzb", "compliant", "binary")
+    laws = (
+        "newton",
+        "moreau",
+        "poisson",
+        "matrix",
+        "routh",
+        "lzb",
+        "compliant",
+        "binary",
+    )
     by = ("v",)
     status = None  # `ok`, or `plastic_limit` of the laws that come there in the limit
 
@@ -281,7 +295,11 @@ class LinearBalls(System):
         delta = np.sqrt(g * g - g + 1)
         w1, w2 = np.sqrt(1 + g - delta), np.sqrt(1 + g + delta)
         squeeze = (np.sin(w1 * t) / w1 - np.sin(w2 * t) / w2) / (2 * delta)
-        v3 = g / (2 * delta) * ((1 - np.cos(w1 * t)) / w1**2 - (1 - np.cos(w2 * t)) / w2**2)
+        v3 = (
+            g
+            / (2 * delta)
+            * ((1 - np.cos(w1 * t)) / w1**2 - (1 - np.cos(w2 * t)) / w2**2)
+        )
         return squeeze, v3
 
     def after(self, v, e, k, eta):

@@ -13,10 +13,19 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 @pytest.mark.release
 def test_three_balls_run(tmp_path):
     """The one that all others are measured against; `all.py --quick` runs the others, too."""
-    command = [sys.executable, str(FOLDER / "three_balls.py"), "--quick", "--out", str(tmp_path)]
+    command = [
+        sys.executable,
+        str(FOLDER / "three_balls.py"),
+        "--quick",
+        "--out",
+        str(tmp_path),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert {path.name for path in tmp_path.iterdir()} == {"three_balls.csv", "three_balls.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "three_balls.csv",
+        "three_balls.png",
+    }
     with (tmp_path / "three_balls.csv").open() as file:
         rows = list(csv.DictReader(file))
     errors = {(row["method"], row["target"]): float(row["error_max"]) for row in rows}
@@ -47,7 +56,9 @@ one = lambda k, e: ji.impact(ji.LZB(e, k, 1.5, rtol=1e-11), ji.chain(jnp.ones(3)
 exact = jax.jit(jax.vmap(one))(k, e).velocity
 print(float(np.abs(run(k, e, 1e-10)[0] - exact).max()))
 """
-    done = subprocess.run([sys.executable, "-c", code, str(FOLDER)], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(FOLDER)], capture_output=True, text=True
+    )
     if done.returncode == 7:
         pytest.skip(done.stdout)
     assert done.returncode == 0, done.stderr[-2000:]

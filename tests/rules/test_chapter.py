@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from chapter_rows import BEFORE, SECTIONS, Figure, flat, run
 
-TEXT = chapter_page.PAGE.read_text(encoding="utf-8") if chapter_page.PAGE.exists() else ""
-ROWS = [row for rows in SECTIONS.values() for row in rows if not isinstance(row, Figure)]
+TEXT = (
+    chapter_page.PAGE.read_text(encoding="utf-8") if chapter_page.PAGE.exists() else ""
+)
+ROWS = [
+    row for rows in SECTIONS.values() for row in rows if not isinstance(row, Figure)
+]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
@@ -32,7 +36,9 @@ def check(row):
     "row",
     [
         pytest.param(
-            row, id=f"{row.where} {row.what}", marks=[pytest.mark.slow] if row.slow else []
+            row,
+            id=f"{row.where} {row.what}",
+            marks=[pytest.mark.slow] if row.slow else [],
         )
         for row in ROWS
     ],
@@ -47,7 +53,16 @@ def test_the_page_holds_every_row_and_figure():
         assert f"## {title}" in lines
         for row in rows:
             first = row.cells[:3] if isinstance(row, Figure) else [row.where, row.what]
-            assert any(x.startswith(chapter_page.line(first)[:-1]) for x in lines), first
-    drawn = [row.number for rows in SECTIONS.values() for row in rows if isinstance(row, Figure)]
-    assert sum(x.startswith("| ") for x in lines) == len(ROWS) + len(drawn) + 2 * len(SECTIONS)
+            assert any(x.startswith(chapter_page.line(first)[:-1]) for x in lines), (
+                first
+            )
+    drawn = [
+        row.number
+        for rows in SECTIONS.values()
+        for row in rows
+        if isinstance(row, Figure)
+    ]
+    assert sum(x.startswith("| ") for x in lines) == len(ROWS) + len(drawn) + 2 * len(
+        SECTIONS
+    )
     assert BEFORE in TEXT

@@ -45,7 +45,9 @@ def random_chains(count, seed):
         wall = (False, True, "left", "both")[i % 4]
         n = 4 - (wall in (True, "left")) - 2 * (wall == "both")
         v = rng.normal(size=n)
-        if wall == "both":  # a body that never comes to rest is no state of the contract
+        if (
+            wall == "both"
+        ):  # a body that never comes to rest is no state of the contract
             wall, n = False, 2
         m = n - 1 + bool(wall)
         v = v if np.min(np.diff(v), initial=0) < 0 else -v
@@ -73,7 +75,9 @@ LIGHT = [
 
 def check_promises(run, entry, accuracy, states):
     """Signs, energy, momentum, scaling: kept, or else (where not promised) reported by the status."""
-    fast = [dataclasses.replace(s, velocity=1e3 * np.asarray(s.velocity)) for s in states]
+    fast = [
+        dataclasses.replace(s, velocity=1e3 * np.asarray(s.velocity)) for s in states
+    ]
     light = [dataclasses.replace(s, mass=1e-4 * np.asarray(s.mass)) for s in states]
     (out, found), (out_fast, _), (out_light, _) = run(states), run(fast), run(light)
     assert np.isfinite(out.velocity).all()
@@ -83,7 +87,9 @@ def check_promises(run, entry, accuracy, states):
         "gap_velocity_sign": found.kinematic,
         "energy": found.energetic,
     }
-    over = ~np.isin(programs.names(out.status), ["max_steps"])  # reported, and few: see below
+    over = ~np.isin(
+        programs.names(out.status), ["max_steps"]
+    )  # reported, and few: see below
     for promise, holds in signs.items():
         if promise in entry.promises:
             assert holds[over].all(), (promise, np.flatnonzero(over & ~holds))
@@ -247,7 +253,9 @@ def test_what_the_host_refuses_has_a_status_inside_jit(name):
     normals = np.asarray(ji.chain([1.0, 1.0, 1.0]).normals)
     asymmetric = State(np.eye(3) + np.eye(3, k=1) / 4, normals, [1, 0, 0])
     no_body = State(np.eye(3), normals * np.array([1, 0]), [1, 0, 0])
-    unknown, negative = (chain([1, 1, 1], [1, 0, 0], gaps=[0, gap]) for gap in (np.nan, -0.1))
+    unknown, negative = (
+        chain([1, 1, 1], [1, 0, 0], gaps=[0, gap]) for gap in (np.nan, -0.1)
+    )
     out, _ = programs.values(name)([asymmetric, no_body, negative, unknown])
     assert programs.names(out.status) == [*["out_of_range"] * 3, "not_finite"]
 
@@ -263,7 +271,13 @@ def test_energies_that_no_number_holds_are_out_of_range(name):
 
 
 SMOOTH = [
-    chain([1.0, 2.0, 1.5, 0.7], [1.0, 0.4, 0.1, -0.6], e=[0.9, 0.7, 0.8], k=[1, 2.5, 0.7], eta=1.4),
+    chain(
+        [1.0, 2.0, 1.5, 0.7],
+        [1.0, 0.4, 0.1, -0.6],
+        e=[0.9, 0.7, 0.8],
+        k=[1, 2.5, 0.7],
+        eta=1.4,
+    ),
     chain([3.0, 1.0, 2.0], [1.0, 0.2, -0.5], e=[0.95, 0.6], k=[1, 3.0], eta=[1.5, 1.3]),
     chain([1.0, 2.0], [1.0, 0.3], True, e=[0.9, 0.8], k=[1.0, 1.4], eta=1.6),
     State(
@@ -279,7 +293,10 @@ STEP = 4e-3  # of differences of fourth order, relative
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW_SLOPES else []) for x in LAWS],
+    [
+        pytest.param(x, marks=[pytest.mark.slow] if x in SLOW_SLOPES else [])
+        for x in LAWS
+    ],
 )
 def test_derivatives(name):
     """Forward equals reverse, and both are the slope of the values."""
@@ -289,7 +306,9 @@ def test_derivatives(name):
     found = programs.derivatives(name)(states)
     forward, reverse = found[0], found[-1]
     for a, b in zip(forward, reverse):
-        np.testing.assert_allclose(a, b, rtol=0, atol=LAWS[name].slope * (1 + np.abs(a).max()))
+        np.testing.assert_allclose(
+            a, b, rtol=0, atol=LAWS[name].slope * (1 + np.abs(a).max())
+        )
         assert np.isfinite(a).all()
     rng = np.random.default_rng(3)
     moved, along = [], []
@@ -316,7 +335,9 @@ def test_derivatives(name):
     for i, (state, way) in enumerate(zip(states, along)):
         n, m = state.size
         way[2] = way[2] * np.broadcast_to(np.asarray(state.k, float), m)
-        found = sum(forward[j][i][:, : len(w)] @ w for j, w in enumerate(way))  # by v, e, k, eta
+        found = sum(
+            forward[j][i][:, : len(w)] @ w for j, w in enumerate(way)
+        )  # by v, e, k, eta
         np.testing.assert_allclose(found[:n], slope[i, :n], rtol=0, atol=1e-6)
 
 
@@ -368,15 +389,21 @@ def wrong():
     def program(kind, mass, normals, gaps, v, e, k, eta, stored):
         scene = ji.Scene(mass, normals, gaps=gaps)
         out = ji.impact(ji.Moreau(e), scene, v)
-        p = jax.lax.switch(kind, [*WRONG.values()], out.impulse, ji.gap_velocity(scene, v), e)
+        p = jax.lax.switch(
+            kind, [*WRONG.values()], out.impulse, ji.gap_velocity(scene, v), e
+        )
         after = v + ji.velocity_change(scene, p)
         energy = ji.kinetic_energy(scene, after) - ji.kinetic_energy(scene, v)
-        wrong = dataclasses.replace(out, velocity=after, impulse=p, energy_change=energy)
+        wrong = dataclasses.replace(
+            out, velocity=after, impulse=p, energy_change=energy
+        )
         return wrong, ji.audit(wrong, scene, v)
 
     def of(kind):
         def run(states):
-            columns = [np.stack(column) for column in zip(*map(programs.padded, states))]
+            columns = [
+                np.stack(column) for column in zip(*map(programs.padded, states))
+            ]
             at = np.full(len(states), [*WRONG].index(kind))
             return jax.tree.map(np.asarray, program(at, *columns))
 

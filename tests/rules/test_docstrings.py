@@ -42,7 +42,9 @@ UNITS = {
     "angle": "[rad]",
     "time": "[s]",
 }
-EXTRA = ("posterior",)  # needs what an extra installs: examples could not run without it
+EXTRA = (
+    "posterior",
+)  # needs what an extra installs: examples could not run without it
 CHECKS = re.compile(r"^_?check_|^as_velocity$|^as_whole$|^as_float_array$")
 
 
@@ -50,8 +52,12 @@ def section(doc, *titles):
     """Entries of sections of a docstring, by name."""
     found = {}
     for title in titles:
-        part = re.search(rf"^{title}:\n((?: {{4}}.*\n|\n(?= {{4}}))*)", doc + "\n", re.M)
-        for row in re.split(r"^(?=\S)", textwrap.dedent(part[1]), flags=re.M) if part else ():
+        part = re.search(
+            rf"^{title}:\n((?: {{4}}.*\n|\n(?= {{4}}))*)", doc + "\n", re.M
+        )
+        for row in (
+            re.split(r"^(?=\S)", textwrap.dedent(part[1]), flags=re.M) if part else ()
+        ):
             names, _, text = row.partition(":")
             found |= {name.strip(): text for name in names.split(",") if text}
     return found
@@ -66,18 +72,25 @@ def raises(function):
     return False
 
 
-def lacks_line(doc):
-    """A docstring begins with one line, and an empty one."""
-    first, *rest = doc.splitlines()
-    return [] if first.endswith((".", ":", "?")) and not (rest and rest[0]) else ["a first line"]
+def lacks_line(doc, lines=1):
+    """A docstring begins with a sentence of so many lines, and an empty one."""
+    sentence = doc.split("\n\n")[0]
+    if sentence.endswith((".", ":", "?")) and sentence.count("\n") < lines:
+        return []
+    return ["a first line"]
 
 
 def lacks(function):
     """What the docstring of a function lacks."""
-    doc, parameters = inspect.getdoc(function) or "", inspect.signature(function).parameters
+    doc, parameters = (
+        inspect.getdoc(function) or "",
+        inspect.signature(function).parameters,
+    )
     described = section(doc, "Args")
     missing = [f"argument `{name}`" for name in parameters if name not in described]
-    missing += [f"`{name}` is not an argument" for name in described if name not in parameters]
+    missing += [
+        f"`{name}` is not an argument" for name in described if name not in parameters
+    ]
     missing += [
         f"the unit {unit} of `{name}`"
         for name, unit in UNITS.items()
@@ -86,12 +99,16 @@ def lacks(function):
         and unit not in described[name]
         and parameters[name].annotation is not bool
     ]
-    missing += [] if re.search(r"^(Returns|Yields):$", doc, re.M) else ["what it returns"]
+    missing += (
+        [] if re.search(r"^(Returns|Yields):$", doc, re.M) else ["what it returns"]
+    )
     if raises(function) and not re.search(r"^Raises:$", doc, re.M):
         missing.append("what it raises")
     missing += [] if ">>>" in doc or function.__name__ in EXTRA else ["an example"]
     place = function.__module__
-    is_theory = place.startswith("jimpact.theory") and place != "jimpact.theory.pictures"
+    is_theory = (
+        place.startswith("jimpact.theory") and place != "jimpact.theory.pictures"
+    )
     if is_theory and "Source" not in doc:
         missing.append("its source")
     return missing + lacks_line(doc)
@@ -102,14 +119,18 @@ def lacks_of_class(kind):
     doc = inspect.getdoc(kind) or ""
     described = section(doc, "Args", "Attributes")
     named = described.keys() | set(re.findall(r"`(\w+)`", doc))
-    wanted = [name for name in inspect.signature(kind).parameters if not name.startswith("_")]
+    wanted = [
+        name for name in inspect.signature(kind).parameters if not name.startswith("_")
+    ]
     missing = [f"`{name}`" for name in wanted if name not in named]
     if "Args:" in doc and ">>>" not in doc:
         missing.append("an example")
     if issubclass(kind, ji.Law) and kind is not ji.Law and "Source:" not in doc:
         missing.append("its source")
     for name, method in vars(kind).items():
-        overrides = any(name in vars(base) for base in kind.__mro__[1:])  # described there
+        overrides = any(
+            name in vars(base) for base in kind.__mro__[1:]
+        )  # described there
         if name.startswith("_") or overrides or not callable(getattr(kind, name)):
             continue
         method = getattr(kind, name)

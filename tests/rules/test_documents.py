@@ -24,7 +24,9 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(ji.__path__, "jimpact."))]
-TESTS = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+TESTS = "".join(
+    path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")
+)
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -68,7 +70,9 @@ def test_docstrings_run(module):
 
 
 def test_readme_runs():
-    done = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
+    done = doctest.testfile(
+        str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS
+    )
     assert done.attempted > 10
     assert done.failed == 0
     assert len(README.splitlines()) <= 120, "a new line takes the place of another one"
@@ -85,7 +89,9 @@ def code_of(path):
     blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.S)
     blocks = [block for block in blocks if runs_here(block)]
     own = [block for block in blocks if ">>>" not in block and "tcp://" not in block]
-    return own, "\n".join(b for b in blocks if ">>>" in b)  # (a cluster does not exist here)
+    return own, "\n".join(
+        b for b in blocks if ">>>" in b
+    )  # (a cluster does not exist here)
 
 
 def documents(paths, long_run=()):
@@ -95,8 +101,14 @@ def documents(paths, long_run=()):
             path,
             id=path.stem,
             marks=[
-                pytest.mark.release if path.stem.startswith(LONGEST) else pytest.mark.slow,
-                *([pytest.mark.long_run] if path.stem.startswith(tuple(long_run)) else []),
+                pytest.mark.release
+                if path.stem.startswith(LONGEST)
+                else pytest.mark.slow,
+                *(
+                    [pytest.mark.long_run]
+                    if path.stem.startswith(tuple(long_run))
+                    else []
+                ),
             ],
         )
         for path in paths
@@ -118,7 +130,9 @@ def test_docs_run(path):
         exec(compile(block, str(path), "exec"), space)
     if prompts:
         runner = doctest.DocTestRunner(optionflags=OPTIONS)
-        runner.run(doctest.DocTestParser().get_doctest(prompts, {}, path.name, str(path), 0))
+        runner.run(
+            doctest.DocTestParser().get_doctest(prompts, {}, path.name, str(path), 0)
+        )
         done = runner.summarize(verbose=False)
         assert done.attempted > 0
         assert done.failed == 0
@@ -130,7 +144,9 @@ def test_code_of_pages_fits_the_column():
     What an example prints is excepted: the program decides where its lines end.
     """
     for path in [ROOT / "README.md", *DOCS]:
-        for block in re.findall(r"^```.*?^```", path.read_text(encoding="utf-8"), re.M | re.S):
+        for block in re.findall(
+            r"^```.*?^```", path.read_text(encoding="utf-8"), re.M | re.S
+        ):
             lines = block.splitlines()
             if ">>>" in block:
                 lines = [line for line in lines if line.startswith((">>>", "..."))]
@@ -170,7 +186,9 @@ def pages(monkeypatch):
     return importlib.import_module("pages")
 
 
-def test_the_gallery_draws_a_picture_of_each_of_its_functions(pages, tmp_path, monkeypatch):
+def test_the_gallery_draws_a_picture_of_each_of_its_functions(
+    pages, tmp_path, monkeypatch
+):
     gallery = importlib.import_module("gallery")
     assert {*gallery.DRAWN} == {path.stem for path in gallery.PICTURES.glob("*.png")}
     monkeypatch.setattr(gallery, "PICTURES", tmp_path)
@@ -181,7 +199,9 @@ def test_the_gallery_draws_a_picture_of_each_of_its_functions(pages, tmp_path, m
 def test_every_public_name_has_a_place_in_the_api(pages):
     names = [name for page in pages.public_names().values() for name in page]
     everything = [
-        x for x in ji.__all__ if x not in ("data", "plot", "theory", "tracks", "__version__")
+        x
+        for x in ji.__all__
+        if x not in ("data", "plot", "theory", "tracks", "__version__")
     ]
     everything += [f"{part.__name__.removeprefix('jimpact.')}.{name}"
                    for part in (ji.plot, ji.theory, ji.data, ji.tracks) for name in part.__all__]  # fmt: skip
@@ -211,8 +231,14 @@ def test_constants_are_complete_and_explained(pages, tmp_path):
             continue
         for line in ast.parse(path.read_text(encoding="utf-8")).body:
             value = getattr(line, "value", None)
-            target = line.targets[0] if isinstance(line, ast.Assign) else getattr(line, "target", 0)
-            number = isinstance(value, ast.Constant) and isinstance(value.value, int | float)
+            target = (
+                line.targets[0]
+                if isinstance(line, ast.Assign)
+                else getattr(line, "target", 0)
+            )
+            number = isinstance(value, ast.Constant) and isinstance(
+                value.value, int | float
+            )
             if isinstance(target, ast.Name) and target.id.isupper() and number:
                 row = f"| `{target.id}` | `{value.value}` |"
                 assert row in page, (path, target.id)
@@ -220,7 +246,9 @@ def test_constants_are_complete_and_explained(pages, tmp_path):
 
 def test_every_law_is_in_the_readme_as_in_the_registry():
     for row in ji.REGISTRY.values():
-        assert f"| `{row.law.__name__}` | {row.right_when} | {row.fails_when} |" in README
+        assert (
+            f"| `{row.law.__name__}` | {row.right_when} | {row.fails_when} |" in README
+        )
 
 
 def test_public_names():
@@ -228,13 +256,18 @@ def test_public_names():
     without = []
     for name in ji.__all__:
         value = getattr(ji, name)
-        assert type(value).__name__ != "module" or name in ("data", "plot", "theory", "tracks"), (
-            name
-        )
+        assert type(value).__name__ != "module" or name in (
+            "data",
+            "plot",
+            "theory",
+            "tracks",
+        ), name
         if callable(value) and not (value.__doc__ or "").strip():
             without.append(name)
     assert not without
-    functions = [x for x in map(ji.__dict__.get, ji.__all__) if type(x).__name__ == "function"]
+    functions = [
+        x for x in map(ji.__dict__.get, ji.__all__) if type(x).__name__ == "function"
+    ]
     bare = [x.__name__ for x in functions if ">>>" not in (x.__doc__ or "")]
     assert not bare, bare
     with pytest.raises(AttributeError, match=r"no name `Lzb`\. Did you mean LZB"):
@@ -242,7 +275,9 @@ def test_public_names():
 
 
 def run_python(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
 
 
 def test_import_sets_nothing_and_is_lazy():
@@ -264,7 +299,9 @@ def code_and_text(notebook):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_and_script_agree(path):
     notebook = nbformat.read(path, as_version=4)
-    assert code_and_text(notebook) == code_and_text(jupytext.read(path.with_suffix(".py")))
+    assert code_and_text(notebook) == code_and_text(
+        jupytext.read(path.with_suffix(".py"))
+    )
     outputs = [o for cell in notebook.cells for o in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not any(output.output_type == "error" for output in outputs)
@@ -303,15 +340,24 @@ def test_notebooks_are_one_course():
     """Each begins with its aim and a drawing of the system, and links to the next."""
     scripts = [jupytext.read(path.with_suffix(".py")) for path in NOTEBOOKS]
     for k, (path, script) in enumerate(zip(NOTEBOOKS, scripts, strict=True)):
-        head, drawing = script.cells[0].source, nbformat.read(path, as_version=4).cells[1]
+        head, drawing = (
+            script.cells[0].source,
+            nbformat.read(path, as_version=4).cells[1],
+        )
         assert f"*Course, part {k}." in head
         assert "You will" in head
-        assert any("image/png" in output.get("data", {}) for output in drawing.outputs), path.stem
-        links = re.findall(r"\]\((\d\w+\.ipynb)\)", "".join(cell.source for cell in script.cells))
+        assert any(
+            "image/png" in output.get("data", {}) for output in drawing.outputs
+        ), path.stem
+        links = re.findall(
+            r"\]\((\d\w+\.ipynb)\)", "".join(cell.source for cell in script.cells)
+        )
         for link in links:
             assert (ROOT / "notebooks" / link).exists(), (path.stem, link)
         if k + 1 < len(NOTEBOOKS):
             assert NOTEBOOKS[k + 1].name in script.cells[-1].source, path.stem
-        code = "\n".join(cell.source for cell in script.cells if cell.cell_type == "code")
+        code = "\n".join(
+            cell.source for cell in script.cells if cell.cell_type == "code"
+        )
         own = set(re.findall(r"^(?:from|import) (jimpact\.\S+)", code, re.M))
         assert not own, "notebooks use public names only"

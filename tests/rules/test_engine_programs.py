@@ -25,12 +25,18 @@ def test_each_program_pins_its_engine_and_says_how_it_is_asked(run):
         assert ast.get_docstring(tree), path
         functions = [line for line in tree.body if isinstance(line, ast.FunctionDef)]
         after = next(each for each in functions if each.name == "after")
-        assert [x.arg for x in after.args.args[:3]] == ["masses", "wall", "restitution"], path
+        assert [x.arg for x in after.args.args[:3]] == [
+            "masses",
+            "wall",
+            "restitution",
+        ], path
 
 
 def test_an_engine_that_is_not_installed_is_named(run, tmp_path, monkeypatch, capsys):
     missing = tmp_path / "engine_missing.py"
-    missing.write_text('# dependencies = ["no_such_engine==1.0"]\nimport no_such_engine\n')
+    missing.write_text(
+        '# dependencies = ["no_such_engine==1.0"]\nimport no_such_engine\n'
+    )
     monkeypatch.setitem(run.PROGRAMS, "missing", missing)
     assert run.measured("missing", sys.executable) == []
     assert 'pip install "no_such_engine==1.0"' in capsys.readouterr().out
@@ -42,8 +48,14 @@ HEAD = "engine,version,scene,setting,v1,v2,v3,v4,v5\n"
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("mine,1.0,S4,fine,-0.99,,,,", "line 2: S4 has 2 balls, but 1 velocities are given"),
-        ("mine,1.0,S9,fine,-0.99,0,,,", "line 2: `scene` must be one of .* but is 'S9'"),
+        (
+            "mine,1.0,S4,fine,-0.99,,,,",
+            "line 2: S4 has 2 balls, but 1 velocities are given",
+        ),
+        (
+            "mine,1.0,S9,fine,-0.99,0,,,",
+            "line 2: `scene` must be one of .* but is 'S9'",
+        ),
         ("mine,1.0,S4,fine,-0.99,nan,,,", "line 2: velocities must be finite numbers"),
         ("mine,1.0,S4,fine,-0.99,fast,,,", "line 2: velocities must be finite numbers"),
     ],

@@ -16,9 +16,13 @@ def test_a_row_holds_what_was_measured():
     for row in table.rows:
         masses, wall, _ = ji.data.ENGINE_SCENES[row.scene]
         m, v = np.array(masses), np.array(row.velocity)
-        assert row.energy_ratio == pytest.approx(m @ v**2 / m[0], abs=2e-3 * m.sum() / m[0])
+        assert row.energy_ratio == pytest.approx(
+            m @ v**2 / m[0], abs=2e-3 * m.sum() / m[0]
+        )
         if not wall:
-            assert row.momentum == pytest.approx(m @ v / m[0], abs=2e-3 * m.sum() / m[0])
+            assert row.momentum == pytest.approx(
+                m @ v / m[0], abs=2e-3 * m.sum() / m[0]
+            )
         assert row.distance <= row.second_distance + 3e-3
 
 
@@ -78,10 +82,14 @@ def test_restitution_of_engines_is_that_of_their_forces():
     """Beside jimpact's forces, cut at 0, and an integration of one that pulls."""
     drake = ji.theory.engine_restitution("drake", 0.8, speed=1.7)
     force = ji.HuntCrossley(3.0, 0.8, exponent=1.0)
-    assert drake == pytest.approx(float(ji.measured_restitution(force, 0.6, 1.7)), abs=1e-9)
+    assert drake == pytest.approx(
+        float(ji.measured_restitution(force, 0.6, 1.7)), abs=1e-9
+    )
     sap = ji.theory.engine_restitution("drake_sap", 0.3, stiffness=3.0, mass=0.6)
     spring = ji.KelvinVoigt(3.0, 0.9)
-    assert sap == pytest.approx(float(ji.measured_restitution(spring, 0.6, 1.7)), abs=1e-12)
+    assert sap == pytest.approx(
+        float(ji.measured_restitution(spring, 0.6, 1.7)), abs=1e-12
+    )
     ratio = -np.log(0.4) / np.hypot(np.pi, np.log(0.4))
     c = ratio * np.sqrt(5 * 0.6 * 3.0)
 
@@ -105,7 +113,10 @@ def test_restitution_of_engines_is_that_of_their_forces():
         (("drake", 0.5), "`speed` must be given for engine 'drake'"),
         (("drake_sap", 0.5, None, 1e5, 0.0), "`mass` must lie in .* has value 0"),
         (("lammps", 1.2), "`restitution` must lie in .* has value 1.2"),
-        (("exudyn_1", 0.3), r"`restitution` must lie in \[0.4877, 1\] for engine 'exudyn_1'"),
+        (
+            ("exudyn_1", 0.3),
+            r"`restitution` must lie in \[0.4877, 1\] for engine 'exudyn_1'",
+        ),
     ],
 )
 def test_parameters_that_no_engine_takes_are_named(arguments, told):

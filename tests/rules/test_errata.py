@@ -30,11 +30,17 @@ def test_6_3_1_signs_and_ends_of_the_work_of_a_contact():
     t = np.linspace(0, np.pi, 20001)
     indentation, rate, impulse = np.sin(t), np.cos(t), 1 - np.cos(t)
     gamma = -rate
-    energy = np.concatenate([[0], np.cumsum(np.diff(impulse) * -(gamma[1:] + gamma[:-1]) / 2)])
-    np.testing.assert_allclose(energy, indentation**2 / 2, atol=1e-7)  # E' = -gamma = rate
+    energy = np.concatenate(
+        [[0], np.cumsum(np.diff(impulse) * -(gamma[1:] + gamma[:-1]) / 2)]
+    )
+    np.testing.assert_allclose(
+        energy, indentation**2 / 2, atol=1e-7
+    )  # E' = -gamma = rate
     assert (-energy[1:-1] < 0).all()  # of +gamma, as printed
     # (6.71), (6.72): compression ends where the rate is 0, not where the indentation is
-    assert np.isclose(impulse[np.argmax(energy)], impulse[np.argmin(abs(rate))], rtol=1e-9)
+    assert np.isclose(
+        impulse[np.argmax(energy)], impulse[np.argmin(abs(rate))], rtol=1e-9
+    )
     assert np.isclose(energy[indentation.argmin()], 0, atol=1e-7)
 
 
@@ -45,9 +51,13 @@ def test_6_3_1_the_energy_is_gone_before_the_indentation(e):
     deepest = 1 / np.sqrt(k)
     stays = deepest * (1 - e**2)
     stiff = k / e**2
-    assert np.isclose(k * deepest, stiff * (deepest - stays), rtol=1e-14)  # the force has no jump
+    assert np.isclose(
+        k * deepest, stiff * (deepest - stays), rtol=1e-14
+    )  # the force has no jump
     given_back = 0.5 * stiff * (deepest - stays) ** 2
-    assert np.isclose(np.sqrt(2 * given_back), e, rtol=1e-14)  # so E = 0 with gamma+ = e
+    assert np.isclose(
+        np.sqrt(2 * given_back), e, rtol=1e-14
+    )  # so E = 0 with gamma+ = e
     assert stays > 0.1 * deepest
 
 
@@ -57,8 +67,12 @@ def test_6_3_1_force_of_stored_energy(exponent):
     force = k * depth**exponent
     energy = k * depth ** (exponent + 1) / (exponent + 1)  # the integral of the force
     up = exponent + 1
-    assert np.isclose(force ** (up / exponent), up * k ** (1 / exponent) * energy, rtol=1e-14)
-    assert not np.isclose(force ** (up / exponent), up * k ** (1 / up) * energy, rtol=0.1)
+    assert np.isclose(
+        force ** (up / exponent), up * k ** (1 / exponent) * energy, rtol=1e-14
+    )
+    assert not np.isclose(
+        force ** (up / exponent), up * k ** (1 / up) * energy, rtol=0.1
+    )
     share = (up * energy) ** (exponent / up)
     assert np.isclose(force, k ** (1 / up) * share, rtol=1e-14)
     assert not np.isclose(force, k ** (1 / exponent + 1) * share, rtol=0.1)
@@ -83,7 +97,9 @@ def test_6_3_1_force_in_expansion(exponent, e):
 
 def test_number_of_contacts_of_6_1_1_and_of_definition_6_1():
     """Three balls on the ground: impulses of three kinds change v; of no contact, none does."""
-    grounded = np.array([[1.0, 0, 0], [-1, 1, 0], [0, -1, 1]])  # ground, ball 1 on 2, ball 2 on 3
+    grounded = np.array(
+        [[1.0, 0, 0], [-1, 1, 0], [0, -1, 1]]
+    )  # ground, ball 1 on 2, ball 2 on 3
     assert np.linalg.matrix_rank(grounded) == 3
     assert np.linalg.matrix_rank(grounded[:, :0]) == 0
 
@@ -137,7 +153,9 @@ def test_equation_6_13():
     m, (e1, e2) = (1.0, 2.0, 3.0), (0.9, 0.8)
     m21, m32 = m[1] / m[0], m[2] / m[1]
     v, _ = collide(m, (1.0, 0.0, 0.0), (e1, e2), (0, 1))
-    assert np.isclose(v[1], (1 - m32 * e2) * (1 + e1) / (1 + m21) / (1 + m32), rtol=1e-14)
+    assert np.isclose(
+        v[1], (1 - m32 * e2) * (1 + e1) / (1 + m21) / (1 + m32), rtol=1e-14
+    )
     assert not np.isclose(v[1], (1 - m32 * e2) * (1 + m21 * e1) / (1 + m21), rtol=0.1)
 
 
@@ -201,7 +219,9 @@ def test_equation_6_16(ratio):
     rates = np.sqrt(np.abs(values))
 
     def compression(t):  # of contact 1, from x' = (1, 0, 0)
-        phase = np.where(rates < 1e-7, t, np.sin(rates * t) / np.where(rates < 1e-7, 1, rates))
+        phase = np.where(
+            rates < 1e-7, t, np.sin(rates * t) / np.where(rates < 1e-7, 1, rates)
+        )
         x = vectors @ (vectors[0] * phase)
         return x[0] - x[1]
 
@@ -219,7 +239,9 @@ def test_equation_6_16(ratio):
 
 def linear_balls(ratio):
     """Squared frequencies and modes of three equal balls on linear springs."""
-    return np.linalg.eigh(np.array([[1.0, -1, 0], [-1, 1 + ratio, -ratio], [0, -ratio, ratio]]))
+    return np.linalg.eigh(
+        np.array([[1.0, -1, 0], [-1, 1 + ratio, -ratio], [0, -ratio, ratio]])
+    )
 
 
 def test_limit_without_a_second_spring():
@@ -280,12 +302,16 @@ def test_equations_6_49_and_6_50():
 
     p = -inverse @ (one + E) @ before
     quadratic = (one - E) @ G @ p  # xi = 0 where qn+ = -E qn-
-    assert np.isclose(change(E), -0.5 * p @ np.linalg.inv(one + E) @ quadratic, rtol=1e-13)
+    assert np.isclose(
+        change(E), -0.5 * p @ np.linalg.inv(one + E) @ quadratic, rtol=1e-13
+    )
     assert not np.isclose(change(E), -0.5 * p @ quadratic, rtol=0.1)
     own = G @ np.array([[0.5, 0.1], [0.1, 0.3]])  # self-adjoint
     used = 0.5 * before @ (own.T @ own.T - one) @ inverse @ before
     assert np.isclose(change(own), used, rtol=1e-13)
-    assert not np.isclose(change(own), 0.5 * before @ (own.T @ own - one) @ inverse @ before, 1e-3)
+    assert not np.isclose(
+        change(own), 0.5 * before @ (own.T @ own - one) @ inverse @ before, 1e-3
+    )
 
 
 def test_proposition_6_4_and_remark_6_6():
@@ -320,7 +346,9 @@ class Block:
         self.t = (t / np.sqrt(t @ self.mass @ t))[:, None]
         self.Xi = np.hstack([self.n, self.t]).T
         self.G = self.n.T @ self.mass @ self.n
-        self.slip = np.array([0.2, 0.3]) / self.norms * np.array([1.0, -0.4])  # [mubar][xi]
+        self.slip = (
+            np.array([0.2, 0.3]) / self.norms * np.array([1.0, -0.4])
+        )  # [mubar][xi]
         self.nH = self.n.T @ self.H
         self.G_mu = self.G - self.nH * self.slip
         self.E = np.array([[0.5, 0.1], [0.2, 0.3]])
@@ -340,7 +368,9 @@ def test_equations_6_54_to_6_57():
     qdot = np.array([0.1, 0.2, 1.0])
     v = block.Xi @ block.mass @ qdot
     D = np.linalg.inv(block.Xi @ block.mass @ block.Xi.T)
-    np.testing.assert_allclose(block.H.T @ block.Xi.T @ D @ v, block.H.T @ qdot, rtol=1e-12)
+    np.testing.assert_allclose(
+        block.H.T @ block.Xi.T @ D @ v, block.H.T @ qdot, rtol=1e-12
+    )
     assert not np.allclose(block.H.T @ block.Xi.T @ v, block.H.T @ qdot, rtol=0.05)
     after, _, _ = block.after()
     rates = block.N.T @ block.Xi.T @ D @ after  # grad f^T qdot+
@@ -401,7 +431,8 @@ def test_proposition_6_6_2():
     """M = G^-1 is positive definite without its condition, which fails here."""
     block = Block()
     norm = [
-        np.linalg.norm(x, 2) for x in (block.G_mu, np.linalg.inv(block.G_mu), block.G, block.nH)
+        np.linalg.norm(x, 2)
+        for x in (block.G_mu, np.linalg.inv(block.G_mu), block.G, block.nH)
     ]
     friction = 20 * np.abs(block.slip).max()
     assert np.prod(norm) * friction > 1
@@ -412,7 +443,10 @@ def test_proposition_6_6_3():
     """|E| (1 + 2 |E|) is not what its proof bounds: an M for which it promises too much."""
     turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
     M, s = np.eye(2) + 10 * turn, 0.08
-    E, limit = s * turn, 1 / np.linalg.norm(M, 2)  # the symmetric part of M is the identity
+    E, limit = (
+        s * turn,
+        1 / np.linalg.norm(M, 2),
+    )  # the symmetric part of M is the identity
     bar = (np.eye(2) - E).T @ M @ (np.eye(2) + E)
     assert s * (1 + 2 * s) < limit < s * (2 + s)
     assert np.linalg.eigvalsh(bar + bar.T).max() < 0
@@ -427,7 +461,10 @@ def test_proposition_6_6_3():
 def test_remark_6_10():
     """The kinetic angle of a flat, wide block tends to pi/3."""
     high = 1e-4
-    mass, N = np.diag([1, 1, (1 + high**2) / 12]), np.array([[0, 0], [1, 1], [-0.5, 0.5]])
+    mass, N = (
+        np.diag([1, 1, (1 + high**2) / 12]),
+        np.array([[0, 0], [1, 1], [-0.5, 0.5]]),
+    )
     W = N.T @ np.linalg.inv(mass) @ N
     assert np.isclose(np.arccos(-W[0, 1] / W[0, 0]), np.pi / 3, atol=1e-6)
 
@@ -445,7 +482,9 @@ def test_remark_6_11():
 
 def test_rocking_matrix():
     """Housner's block: the base turns from one corner to the other, the sliding rate keeps its sign."""
-    E, printed = (np.array([[0, s, 0], [s, 0, 0], [0, 0, -s]]) * 0.8 for s in (1.0, -1.0))
+    E, printed = (
+        np.array([[0, s, 0], [s, 0, 0], [0, 0, -s]]) * 0.8 for s in (1.0, -1.0)
+    )
     before = np.array([-1.0, 0.0, 0.5])  # corner 1 comes down about corner 2
     after = -E @ before
     assert after[1] > 0  # corner 2 lifts off

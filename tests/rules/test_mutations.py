@@ -27,4 +27,7 @@ def test_the_tests_that_should_notice_exist():
             file, _, function = node_of(test).partition("::")
             text = (ROOT / file).read_text(encoding="utf-8")
             name = re.escape(function.partition("[")[0])
-            assert not name or re.search(rf"^def {name}\(", text, re.M), (mutation.name, test)
+            assert not name or re.search(rf"^def {name}\(", text, re.M), (
+                mutation.name,
+                test,
+            )

@@ -64,7 +64,9 @@ class Push(ji.Law):
 @pytest.fixture
 def registered():
     before = dict(ji.REGISTRY)
-    ji.register("blended", Blended, summary="for the tests", promises=("velocity_scaling",))
+    ji.register(
+        "blended", Blended, summary="for the tests", promises=("velocity_scaling",)
+    )
     yield ji.REGISTRY["blended"]
     ji.REGISTRY.clear()
     ji.REGISTRY.update(before)
@@ -82,9 +84,17 @@ def test_one_method_is_enough():
     [
         (lambda p: p, TypeError, r"`Returning.impulses` must return `ji.Impulses`"),
         (lambda p: None, TypeError, "returns NoneType"),
-        (lambda p: ji.Impulses(p[0]), ValueError, r"`normal` of shape \(2,\), but .* \(\)"),
+        (
+            lambda p: ji.Impulses(p[0]),
+            ValueError,
+            r"`normal` of shape \(2,\), but .* \(\)",
+        ),
         (lambda p: ji.Impulses(p, p), ValueError, r"`tangential` of shape \(0,\)"),
-        (lambda p: ji.Impulses(p, status=99), ValueError, r"`status` of a row of `ji.STATUS`"),
+        (
+            lambda p: ji.Impulses(p, status=99),
+            ValueError,
+            r"`status` of a row of `ji.STATUS`",
+        ),
     ],
 )
 def test_what_is_no_impulses_of_the_contacts_is_refused(returned, error, words):
@@ -111,7 +121,9 @@ def test_what_every_law_gets_for_nothing():
     slope = jax.jit(jax.grad(lambda law: ji.impact(law, BALLS, V).velocity[0]))(law)
     assert type(slope) is Blended
     assert float(slope.share) != 0
-    with pytest.raises(ValueError, match=r"`share` must lie in \[0, 0\.5\], but has value 0\.7"):
+    with pytest.raises(
+        ValueError, match=r"`share` must lie in \[0, 0\.5\], but has value 0\.7"
+    ):
         Blended(0.8, 0.7)
     with pytest.raises(ValueError, match=r"`share` must have shape \(2,\)"):
         ji.impact(Blended(0.8, [0.1, 0.2, 0.3]), BALLS, V)
@@ -119,13 +131,18 @@ def test_what_every_law_gets_for_nothing():
 
 def test_a_law_without_friction_on_a_scene_with_tangents():
     """The example of `ji.Law` and docs/own_law.md: a normal law leaves tangential impulses at 0."""
-    normals, tangents = [[0.0, 0.0], [1.0, 1.0], [-0.5, 0.5]], [[1.0, 1.0], [0, 0], [0.2, 0.2]]
+    normals, tangents = (
+        [[0.0, 0.0], [1.0, 1.0], [-0.5, 0.5]],
+        [[1.0, 1.0], [0, 0], [0.2, 0.2]],
+    )
     block = ji.Scene([1.0, 1.0, 0.1], normals, tangents)
     out = ji.impact(Blended(0.8, 0.25), block, [0.3, -1.0, 0.1])
     held = ji.impact(ji.Newton(0.6), block, [0.3, -1.0, 0.1])
     np.testing.assert_allclose(out.velocity, held.velocity, atol=1e-14)
     np.testing.assert_array_equal(out.tangential_impulse, [0.0, 0.0])
-    contact = ji.Contact(np.eye(2), [-1.0, 0.0], tangential_block=(np.eye(2), np.eye(2), [0.1, 0]))
+    contact = ji.Contact(
+        np.eye(2), [-1.0, 0.0], tangential_block=(np.eye(2), np.eye(2), [0.1, 0])
+    )
     assert contact.normal_delassus.shape == (2, 2)
     assert contact.whole_delassus.shape == (4, 4)
 
@@ -139,7 +156,10 @@ def test_it_has_a_history_and_a_gap_scale():
     slower = ji.VelocityDependent(ji.LZB(0.9, 1.0), speed_exponent=0.0)
     got, held = (ji.history(x, BALLS, V, samples=8) for x in (slower, ji.LZB(0.9, 1.0)))
     np.testing.assert_allclose(got.energy, held.energy, atol=1e-12)
-    deep = [ji.theory.gap_scale(BALLS, x, V).delta for x in (law, same, ji.VelocityDependent(same))]
+    deep = [
+        ji.theory.gap_scale(BALLS, x, V).delta
+        for x in (law, same, ji.VelocityDependent(same))
+    ]
     np.testing.assert_allclose(deep, np.broadcast_to(deep[1], (3, 2)), rtol=1e-12)
     with pytest.raises(TypeError, match="must have a history"):
         ji.history(Blended(0.8, 0.25), BALLS, V)
@@ -148,7 +168,9 @@ def test_it_has_a_history_and_a_gap_scale():
     hard = ji.Compliant(Steel(0.5), initial_energy=0.1)
     out = ji.impact(hard, BALLS, V)
     np.testing.assert_allclose(
-        out.velocity, ji.impact(ji.LZB(1.0, initial_energy=0.1), BALLS, V).velocity, atol=1e-6
+        out.velocity,
+        ji.impact(ji.LZB(1.0, initial_energy=0.1), BALLS, V).velocity,
+        atol=1e-6,
     )
 
 
@@ -180,7 +202,9 @@ def test_compare_and_the_registry(registered):
     assert "blended" not in alone.entries
     both = ji.compare(BALLS, V, restitution=0.9, share=0.1)
     same = ji.impact(Blended(0.9, 0.1), BALLS, V)
-    np.testing.assert_allclose(both.entries["blended"].outcome.velocity, same.velocity, atol=1e-14)
+    np.testing.assert_allclose(
+        both.entries["blended"].outcome.velocity, same.velocity, atol=1e-14
+    )
     with pytest.raises((ValueError, TypeError)):
         ji.register("blended", Blended, promises=("beauty",))
     with pytest.raises(TypeError):
@@ -190,10 +214,14 @@ def test_compare_and_the_registry(registered):
 def test_it_is_fitted_within_its_domain():
     pre = np.array([[1.0, 0.0, -0.5], [2.0, 0.5, 0.0], [1.0, 0.2, -1.0]])
     post = np.array([ji.impact(Blended(0.8, 0.25), BALLS, v).velocity for v in pre])
-    found = ji.fit(Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2)
+    found = ji.fit(
+        Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2
+    )
     np.testing.assert_allclose(found.value, [0.25], atol=1e-9)
     post = np.array([ji.impact(ji.Newton(0.1), BALLS, v).velocity for v in pre])
-    edge = ji.fit(Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2)
+    edge = ji.fit(
+        Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2
+    )
     np.testing.assert_allclose(edge.value, [0.5])
     assert edge.at_bound.all()
 
@@ -253,8 +281,12 @@ def test_lists_of_traced_numbers():
         law = ji.Newton(jnp.stack([0.9 * one, 0.1 * x]))
         return ji.impact(law, scene, jnp.stack([x, 0 * one, -one])).velocity[1]
 
-    np.testing.assert_allclose(jax.jit(jax.grad(listed))(3.0), jax.grad(stacked)(3.0), rtol=1e-12)
-    dense = jax.grad(lambda m: ji.kinetic_energy(ji.Scene([m, 1.0], [[-1.0], [m / m]]), [2.0, 0.0]))
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(listed))(3.0), jax.grad(stacked)(3.0), rtol=1e-12
+    )
+    dense = jax.grad(
+        lambda m: ji.kinetic_energy(ji.Scene([m, 1.0], [[-1.0], [m / m]]), [2.0, 0.0])
+    )
     assert float(dense(3.0)) == 2.0
 
 
@@ -267,7 +299,9 @@ def test_advise_tries_it():
 
     ji.register("half", Half, summary="for the tests", simplicity=0.5)
     try:
-        advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
+        advice = ji.advise(
+            ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False
+        )
         assert advice.name == "half"
         assert [*advice.candidates][:2] == ["half", "newton"]
         with pytest.raises(
@@ -284,4 +318,7 @@ def test_declared_parameters_of_our_laws():
         assert row.parameters, name
         assert set(row.required) <= set(row.parameters), name
         for field in dataclasses.fields(row.law):
-            assert field.name in row.arguments or row.make is not None, (name, field.name)
+            assert field.name in row.arguments or row.make is not None, (
+                name,
+                field.name,
+            )

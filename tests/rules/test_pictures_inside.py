@@ -70,25 +70,43 @@ def correlated_draws():
 
 def outcome(velocity, status=0):
     zero = np.zeros(2)
-    return ji.Impact(jnp.asarray(velocity), zero, zero[:0], np.float64(-0.1), 0.0, np.int32(status))
+    return ji.Impact(
+        jnp.asarray(velocity), zero, zero[:0], np.float64(-0.1), 0.0, np.int32(status)
+    )
 
 
 def entry(law, fine=True):
     yes, no = np.bool_(True), np.bool_(fine)
-    audit = Audit(yes, yes, no, yes, *([np.float64(0.0)] * (len(dataclasses.fields(Audit)) - 4)))
+    audit = Audit(
+        yes, yes, no, yes, *([np.float64(0.0)] * (len(dataclasses.fields(Audit)) - 4))
+    )
     return Entry(law, outcome(AFTER), audit, 0.9, 0.4, 1e-5, 1.0)
 
 
 def comparison():
-    names = ["lzb", "newton", "moreau", "poisson", "binary", "restitution_matrix", "compliant"]
+    names = [
+        "lzb",
+        "newton",
+        "moreau",
+        "poisson",
+        "binary",
+        "restitution_matrix",
+        "compliant",
+    ]
     entries = {name: entry(ji.Newton(0.5), name != "newton") for name in names}
     return ji.plot.comparison(Comparison(BALLS, STRIKE, entries), AFTER, "three balls")
 
 
 def energy_plane():
-    rows = {"newton": AFTER, "moreau": [-1 / 3, 2 / 3, 2 / 3], "binary": [0.0, 0.0, 1.0]}
+    rows = {
+        "newton": AFTER,
+        "moreau": [-1 / 3, 2 / 3, 2 / 3],
+        "binary": [0.0, 0.0, 1.0],
+    }
     entries = {
-        name: dataclasses.replace(entry(ji.Newton(0.5), name != "newton"), outcome=outcome(v))
+        name: dataclasses.replace(
+            entry(ji.Newton(0.5), name != "newton"), outcome=outcome(v)
+        )
         for name, v in rows.items()
     }
     return ji.plot.energy_plane(Comparison(BALLS, STRIKE, entries), "three balls")
@@ -116,7 +134,8 @@ def chart(gradients):
     uncertain = {"velocity": 1e-13, "gradient": 1e-12}
     reference = Reference("order 8", uncertain, AFTER, np.zeros(2), 1.0)
     return ji.plot.work_precision(
-        WorkPrecision(STRIKE, points, reference, {}, {}, {}, 64, 16, 10.0, 3), "three balls"
+        WorkPrecision(STRIKE, points, reference, {}, {}, {}, 64, 16, 10.0, 3),
+        "three balls",
     )
 
 
@@ -151,7 +170,9 @@ def stability():
     names = [(name,) for name in AXES] + list(itertools.combinations(AXES, 2))
     slices = {method: tuple(piece(x) for x in names) for method in methods}
     confirmation = Confirmation(1, 1, 1, 0.0)
-    return StabilityMap(methods, AXES, base, slices, np.zeros((0, 7)), {}, confirmation, 100)
+    return StabilityMap(
+        methods, AXES, base, slices, np.zeros((0, 7)), {}, confirmation, 100
+    )
 
 
 def validity():
@@ -161,7 +182,9 @@ def validity():
     ends = {"moreau": AFTER + 0.3, "binary": AFTER}
     level = {"moreau": 0.6, "binary": 0.0}
     return ji.plot.validity_map(
-        ValidityMap(BALLS, STRIKE, ratios, eta, velocity, 0.6 * share, share * 0, ends, level)
+        ValidityMap(
+            BALLS, STRIKE, ratios, eta, velocity, 0.6 * share, share * 0, ends, level
+        )
     )
 
 
@@ -169,17 +192,30 @@ def advice():
     names = ("newton", "moreau", "poisson", "binary", "restitution_matrix", "lzb")
     rows = {
         name: Candidate(
-            ji.Newton(0.5), BALLS, AFTER, AFTER - 0.1, AFTER + 0.1, 1e-2, 0.3, "negative_impulse"
+            ji.Newton(0.5),
+            BALLS,
+            AFTER,
+            AFTER - 0.1,
+            AFTER + 0.1,
+            1e-2,
+            0.3,
+            "negative_impulse",
         )
         for name in names
     }
     none = np.zeros(2)
-    result = Advice("lzb", 0.01, False, "lzb", STRIKE, none, rows, (), none, (), 8, None)
+    result = Advice(
+        "lzb", 0.01, False, "lzb", STRIKE, none, rows, (), none, (), 8, None
+    )
     return ji.plot.advice(result, "Three balls, stiffness unknown")
 
 
 def rocking():
-    a, mu, e = np.linspace(0.5, 4, 6), np.array([0.0, 0.1, 0.3]), np.array([0.1, 0.5, 0.9])
+    a, mu, e = (
+        np.linspace(0.5, 4, 6),
+        np.array([0.0, 0.1, 0.3]),
+        np.array([0.1, 0.5, 0.9]),
+    )
     shape = (6, 3, 3)
     gamma = np.linspace(0, 1.5, 6)[:, None, None, None] * np.ones((*shape, 2))
     one = np.ones(shape)
@@ -196,7 +232,9 @@ def outcomes(masses, wall):
     v = np.zeros(len(masses))
     v[0] = 1.0
     result = ji.theory.admissible_set(scene, v)
-    return ji.plot.admissible_set(result, {"Newton's cradle": result.plastic, "at rest": 0 * v})
+    return ji.plot.admissible_set(
+        result, {"Newton's cradle": result.plastic, "at rest": 0 * v}
+    )
 
 
 def region():
@@ -256,7 +294,10 @@ def texts(figure):
     """What is written in a figure, and where [pixels]."""
     renderer, ticks, drawn = figure.canvas.get_renderer(), set(), set()
     for axes in figure.axes:
-        sides = (axes.xaxis, axes.viewLim.intervalx), (axes.yaxis, axes.viewLim.intervaly)
+        sides = (
+            (axes.xaxis, axes.viewLim.intervalx),
+            (axes.yaxis, axes.viewLim.intervaly),
+        )
         for axis, view in sides:
             low, high = sorted(view)
             for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
@@ -265,7 +306,9 @@ def texts(figure):
                 if axes.axison and low <= tick.get_loc() <= high:
                     drawn |= {label for label in labels if label.get_visible()}
     all_texts = figure.findobj(lambda x: isinstance(x, Text) and x.get_visible())
-    written = [x for x in all_texts if x.get_text().strip() and (x not in ticks or x in drawn)]
+    written = [
+        x for x in all_texts if x.get_text().strip() and (x not in ticks or x in drawn)
+    ]
     return [(x, x.get_window_extent(renderer)) for x in written]
 
 
@@ -288,7 +331,10 @@ def test_layout(name):
         assert inside, f"{text.get_text()!r} is cut off"
         assert text.get_fontsize() >= SMALL - 0.2, f"{text.get_text()!r} is small"
     for (one, a), (two, b) in itertools.combinations(places, 2):
-        over = min(a.x1, b.x1) - max(a.x0, b.x0) > 1 and min(a.y1, b.y1) - max(a.y0, b.y0) > 1
+        over = (
+            min(a.x1, b.x1) - max(a.x0, b.x0) > 1
+            and min(a.y1, b.y1) - max(a.y0, b.y0) > 1
+        )
         turned = one.get_rotation() % 90 or two.get_rotation() % 90
         assert turned or not over, f"{one.get_text()!r} and {two.get_text()!r} overlap"
     for axes in figure.axes:
@@ -300,7 +346,9 @@ def test_layout(name):
         for label, axis in ((axes.get_xlabel(), "x"), (axes.get_ylabel(), "y")):
             ticks = getattr(axes, f"get_{axis}ticklabels")()
             silent = not any(tick.get_text() and tick.get_visible() for tick in ticks)
-            categories = name == "correlation" or (axis == "y" and name == "stability_map")
+            categories = name == "correlation" or (
+                axis == "y" and name == "stability_map"
+            )
             assert silent or categories or labelled(label), (axis, label, place)
 
 
@@ -323,8 +371,12 @@ def test_every_kind_of_picture_is_here():
 
 
 def test_no_two_lines_of_a_chart_look_alike():
-    styles = _styles({f"method {i}": (SETTING,) for i in range(10)} | {"law": (LAW,), "b": (LAW,)})
-    looks = [(style["color"], style["marker"], style["ls"]) for style in styles.values()]
+    styles = _styles(
+        {f"method {i}": (SETTING,) for i in range(10)} | {"law": (LAW,), "b": (LAW,)}
+    )
+    looks = [
+        (style["color"], style["marker"], style["ls"]) for style in styles.values()
+    ]
     assert len(set(looks)) == len(looks)
     assert len({style["color"] for style in styles.values()}) == 11  # laws are grey
 
@@ -338,7 +390,9 @@ def test_the_law_closest_to_the_measured_velocities_is_named():
     result = Comparison(BALLS, STRIKE, entries, measured=AFTER)
     assert result.closest == ("near", "as near")
     assert result.distances["far"] == pytest.approx(0.1)
-    assert "closest to the measured velocities: near, as near (rms 0.01 m/s)" in str(result)
+    assert "closest to the measured velocities: near, as near (rms 0.01 m/s)" in str(
+        result
+    )
     labels = [x.get_text() for x in ji.plot.comparison(result).legends[0].get_texts()]
     assert "closest to the measured velocities" in labels
     assert dataclasses.replace(result, measured=None).closest == ()
@@ -346,7 +400,9 @@ def test_the_law_closest_to_the_measured_velocities_is_named():
 
 def test_a_history_must_be_one():
     batch = jax.tree.map(lambda x: np.stack([x, x]), impact_history())
-    with pytest.raises(ValueError, match="`result` must be of one impact, but is a batch"):
+    with pytest.raises(
+        ValueError, match="`result` must be of one impact, but is a batch"
+    ):
         ji.plot.history(batch)
     with pytest.raises(TypeError, match="`drawn` must be a chain"):
         ji.plot.system(ji.Scene([1.0], [[1.0]]), [1.0])
@@ -357,7 +413,9 @@ def test_residuals_are_drawn_over_what_was_fitted():
     here = ~np.isnan(fitted.residual)
     dots = measured.lines[-1]
     np.testing.assert_array_equal(dots.get_xdata(), fitted.predicted[here])
-    np.testing.assert_allclose(dots.get_ydata(), (fitted.predicted + fitted.residual)[here])
+    np.testing.assert_allclose(
+        dots.get_ydata(), (fitted.predicted + fitted.residual)[here]
+    )
 
 
 def test_regions_of_a_corner_plot_hold_what_they_say():
@@ -368,9 +426,13 @@ def test_regions_of_a_corner_plot_hold_what_they_say():
     inverse = np.linalg.inv(fit.covariance[:2, :2])
     for line, limit in zip(pair.lines[1:3], (2.279, 5.991), strict=True):
         away = np.stack(line.get_data()) - fit.value[:2, None]
-        np.testing.assert_allclose(np.sum(away * (inverse @ away), axis=0), limit, rtol=1e-3)
+        np.testing.assert_allclose(
+            np.sum(away * (inverse @ away), axis=0), limit, rtol=1e-3
+        )
     for axes, error in ((one, 0.02), (other, 0.03)):
-        assert max(axes.lines[0].get_ydata()) == pytest.approx(1 / (error * np.sqrt(2 * np.pi)))
+        assert max(axes.lines[0].get_ydata()) == pytest.approx(
+            1 / (error * np.sqrt(2 * np.pi))
+        )
     with pytest.raises(ValueError, match=r"`draws` must have shape \(N, 3\)"):
         ji.plot.corner(fit, np.ones((5, 2)))
     with pytest.raises(ValueError, match="`fit` must have a standard error"):

@@ -18,7 +18,18 @@ def block_and_its_pictures():
     after = np.asarray(comparison.entries["newton"].outcome.velocity)
     row, none = Candidate(law, scene, after, after, after, 0.1, 0.2, "ok"), np.zeros(2)
     advice = Advice(
-        "newton", 0.5, True, "newton", before, none, {"newton": row}, (), none, (), 1, None
+        "newton",
+        0.5,
+        True,
+        "newton",
+        before,
+        none,
+        {"newton": row},
+        (),
+        none,
+        (),
+        1,
+        None,
     )
     pictures = (ji.plot.comparison, comparison), (ji.plot.advice, advice)
     return block, scene, after, pictures
@@ -27,14 +38,19 @@ def block_and_its_pictures():
 @pytest.mark.slow
 def test_metres_and_radians_a_second_have_axes_of_their_own():
     block, scene, after, pictures = block_and_its_pictures()
-    root = np.sqrt(np.diag(np.asarray(scene.mass)) if scene.mass.ndim == 2 else scene.mass)
+    root = np.sqrt(
+        np.diag(np.asarray(scene.mass)) if scene.mass.ndim == 2 else scene.mass
+    )
     for picture, result in pictures:
         shown, _ = picture(result).axes  # without names: one unit for all
         assert shown.get_ylabel() == "velocity after the impact · √inertia [√J]"
         drawn = [x.get_ydata()[0] for x in shown.lines if x.get_marker() == "o"]
         np.testing.assert_allclose(drawn, root * after)
         moves, turns, _ = picture(result, names=block.velocity_names).axes
-        for axes, unit, wanted in ((moves, "m/s", after[:2]), (turns, "rad/s", after[2:])):
+        for axes, unit, wanted in (
+            (moves, "m/s", after[:2]),
+            (turns, "rad/s", after[2:]),
+        ):
             assert axes.get_ylabel() == f"velocity after the impact [{unit}]"
             drawn = [x.get_ydata()[0] for x in axes.lines if x.get_marker() == "o"]
             np.testing.assert_allclose(drawn, wanted)
@@ -75,7 +91,9 @@ def test_the_map_of_random_gaps_shows_those_that_matter():
     loud = int(np.argmax(result.std))
     cross = np.zeros((4, 3))
     cross[loud] = [2.0, 0.1, -3.0]
-    result = replace(result, cross_covariance=cross, gap_covariance=np.diag([1.0, 4.0, 1.0]))
+    result = replace(
+        result, cross_covariance=cross, gap_covariance=np.diag([1.0, 4.0, 1.0])
+    )
     figure = ji.plot.monte_carlo(result)
     labels = [(x.get_xlabel(), x.get_ylabel()) for x in figure.axes]
     assert any(x.startswith("gap 1") and y.startswith("gap 3") for x, y in labels)

@@ -80,15 +80,23 @@ def test_laws(name):
     [("poisson", "plane"), ("lzb", "plane"), ("moreau", "space"), ("lzb", "space")],
 )
 def test_laws_with_friction(name, scene):
-    at, v = (PLANAR, VELOCITY) if scene == "plane" else (BOX.scene(BOX.touching()), IN_SPACE)
-    assert not coarse_products(slopes(after(WITH_FRICTION[name], at)), jnp.array(0.6), v)
+    at, v = (
+        (PLANAR, VELOCITY)
+        if scene == "plane"
+        else (BOX.scene(BOX.touching()), IN_SPACE)
+    )
+    assert not coarse_products(
+        slopes(after(WITH_FRICTION[name], at)), jnp.array(0.6), v
+    )
 
 
 MOTIONS = {
     "events": (ji.LZB, {"method": "events"}),
     "time_stepping": (ji.Moreau, {"method": "time_stepping", "step": 0.01}),
     "contact_forces": (
-        lambda e, friction: ji.Compliant(ji.Bistiffness(1e4, 1.5, e), friction=friction),
+        lambda e, friction: ji.Compliant(
+            ji.Bistiffness(1e4, 1.5, e), friction=friction
+        ),
         {"method": "contact_forces"},
     ),
 }

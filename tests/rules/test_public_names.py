@@ -17,8 +17,16 @@ PUBLIC = {
 MOST = 100  # names at the top
 TESTS = Path(__file__).parents[1]
 # what is named `_inside` tests the inside of a room, and goes with it
-FILES = [path for path in sorted(TESTS.glob("*/test_*.py")) if not path.stem.endswith("_inside")]
-PROGRAMS = "benchmarks", "chapter", "validation"  # folders of programs, which may look inside
+FILES = [
+    path
+    for path in sorted(TESTS.glob("*/test_*.py"))
+    if not path.stem.endswith("_inside")
+]
+PROGRAMS = (
+    "benchmarks",
+    "chapter",
+    "validation",
+)  # folders of programs, which may look inside
 HELPERS = {
     path.stem: path
     for path in (*TESTS.glob("*.py"), *TESTS.glob("*/*.py"))
@@ -37,7 +45,9 @@ def imported(tree):
 
 def test_the_top_is_read_in_one_look():
     count = sum(not name.startswith("_") for name in ji.__all__)
-    assert count <= MOST, "a new name takes the place of another one, or stays in its module"
+    assert count <= MOST, (
+        "a new name takes the place of another one, or stays in its module"
+    )
 
 
 def with_helpers(path):
@@ -45,7 +55,10 @@ def with_helpers(path):
     files, waiting = set(), [path]
     while waiting:
         files.add(each := waiting.pop())
-        names = {module for module, _ in imported(ast.parse(each.read_text(encoding="utf-8")))}
+        names = {
+            module
+            for module, _ in imported(ast.parse(each.read_text(encoding="utf-8")))
+        }
         waiting += {HELPERS[name] for name in names & HELPERS.keys()} - files
     return files
 
@@ -54,12 +67,21 @@ def with_helpers(path):
 def test_nothing_of_ours_is_reached_by_an_underscore(path):
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Attribute) and node.attr.startswith("_"):
-            assert node.attr.endswith("__") or ast.unparse(node.value) == "self", ast.unparse(node)
+            assert node.attr.endswith("__") or ast.unparse(node.value) == "self", (
+                ast.unparse(node)
+            )
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_imports_are_public(path):
     trees = [ast.parse(each.read_text(encoding="utf-8")) for each in with_helpers(path)]
-    own = [x for tree in trees for x in imported(tree) if x[0].partition(".")[0] == "jimpact"]
-    private = [x for x in own if x[0] not in PUBLIC or x[1] not in {None, *PUBLIC[x[0]]}]
+    own = [
+        x
+        for tree in trees
+        for x in imported(tree)
+        if x[0].partition(".")[0] == "jimpact"
+    ]
+    private = [
+        x for x in own if x[0] not in PUBLIC or x[1] not in {None, *PUBLIC[x[0]]}
+    ]
     assert not private

@@ -18,7 +18,11 @@ def test_a_summary_says_which_velocities_are_angular():
     unnamed = ji.summary(still, scene, zeros)
     assert "v+   [m/s, or rad/s of an angle]" in unnamed
     named = ji.summary(still, scene, zeros, block.velocity_names)
-    assert [line.split()[-1] for line in named.splitlines()[5:8]] == ["[m/s]", "[m/s]", "[rad/s]"]
+    assert [line.split()[-1] for line in named.splitlines()[5:8]] == [
+        "[m/s]",
+        "[m/s]",
+        "[rad/s]",
+    ]
     pair = ji.chain([1.0, 1.0])
     one, none = zeros[:1], np.zeros(0)
     out = ji.Impact(zeros[:2], one, none, np.zeros(()), np.zeros(()), np.array(0))
@@ -27,7 +31,9 @@ def test_a_summary_says_which_velocities_are_angular():
 
 def test_picture_of_a_rocking_record():
     a, one = np.array([0.4, 1.0, 2.0, 3.0, 4.0]), np.ones((5, 1, 1))
-    gamma = np.array([[0.0, 0.0], [0.0, 0.4], [0.5, 0.04], [0.5, 0.4], [np.nan, np.nan]])
+    gamma = np.array(
+        [[0.0, 0.0], [0.0, 0.4], [0.5, 0.04], [0.5, 0.4], [np.nan, np.nan]]
+    )
     record = ji.theory.RockingDispersion(
         a, np.array([0.3]), np.array([0.5]), gamma[:, None, None], one, one, one, one
     )
@@ -37,9 +43,7 @@ def test_picture_of_a_rocking_record():
     assert "critical angle 79.42 degrees" in str(record)
 
 
-NOUNS = (
-    "bodies coordinates velocities contacts shots starts steps parameters degrees samples impacts"
-)
+NOUNS = "bodies coordinates velocities contacts shots starts steps parameters degrees samples impacts"
 ONE_OF_MANY = re.compile(rf"(?<![\w.])1 ({NOUNS.replace(' ', '|')})\b")
 MINUS_ZERO = re.compile(r"(?<![\w.])-0(\.0+)?(e[-+]\d+)?(?![\w.])")
 
@@ -55,7 +59,9 @@ def one_of_each():
     yield out
     yield ji.summary(out, ball, before[1])
     for shots in (1, 2):
-        data = ji.Experiments(before[:1].repeat(shots, 0), after[:1].repeat(shots, 0) + 0.01, 0.02)
+        data = ji.Experiments(
+            before[:1].repeat(shots, 0), after[:1].repeat(shots, 0) + 0.01, 0.02
+        )
         fit = ji.fit(law, ball, data, starts=1)
         yield fit
         yield fit.predict(before)
@@ -67,7 +73,11 @@ def one_of_each():
 def of_bodies_that_turn():
     """Reports of a block that lands on a corner."""
     block = ji.Block(1.0, 2.0)
-    scene, law, before = block.scene(block.touching(0.2)), ji.Newton(0.4), [0.0, -1.0, 0.0]
+    scene, law, before = (
+        block.scene(block.touching(0.2)),
+        ji.Newton(0.4),
+        [0.0, -1.0, 0.0],
+    )
     out = ji.impact(law, scene, before)
     yield out
     yield ji.summary(out, scene, before)

@@ -166,7 +166,11 @@ def rooms_named(path):
     spaces = {"ji": PACKAGE} | {
         f"ji.{x}": PACKAGE / x for x in ("plot", "theory", "data", "tracks")
     }
-    homes = {(space, name): home for space in spaces for name, home in homes_in(spaces[space])}
+    homes = {
+        (space, name): home
+        for space in spaces
+        for name, home in homes_in(spaces[space])
+    }
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             place = ast.unparse(node.value), node.attr
@@ -241,11 +245,17 @@ def alone():
     """What each room says when it is imported while those beside and above it are blocked."""
     asked = {}
     for room in STOREY:
-        blocked = [other for other in STOREY if other != room and STOREY[other] >= STOREY[room]]
-        own = sorted(m for m in modules() if room_of(m) == room and not m.endswith("__main__"))
+        blocked = [
+            other for other in STOREY if other != room and STOREY[other] >= STOREY[room]
+        ]
+        own = sorted(
+            m for m in modules() if room_of(m) == room and not m.endswith("__main__")
+        )
         asked[room] = blocked, own
     command = [sys.executable, "-W", "ignore", "-c", ALONE, json.dumps(asked)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, check=False
+    )
     assert done.returncode == 0, done.stderr[-600:]
     return dict(map(json.loads, done.stdout.splitlines()))
 
@@ -289,13 +299,20 @@ def test_impacts_need_no_package_but_jax_and_what_it_brings():
     """Pictures, the chart, gradient descent and the command line name what they need."""
     without = ["matplotlib", "diffrax", "optax", "tyro", "rich", "platformdirs"]
     script = BARE.format(without=without)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT
+    )
     assert done.returncode == 0, done.stderr[-600:]
     velocity, *said = done.stdout.splitlines()
-    assert velocity == "[-0.125, 0.375]"  # (m1 - e m2) / (m1 + m2), m1 (1 + e) / (m1 + m2)
+    assert (
+        velocity == "[-0.125, 0.375]"
+    )  # (m1 - e m2) / (m1 + m2), m1 (1 + e) / (m1 + m2)
     said.append(done.stderr.strip())
     for module, line in zip(without[:4], said, strict=True):
-        assert f"{module} must be installed for this, but is not: pip install {module}." in line
+        assert (
+            f"{module} must be installed for this, but is not: pip install {module}."
+            in line
+        )
 
 
 LEFT_OUT = """
@@ -321,7 +338,11 @@ for ask in ({asked}):
 # Rooms that can be left out of a copy, and what is asked for then.
 ASKED = {
     "tracks": ("ji.tracks.read", "ji.plot.track", "ji.read_study('study.toml')"),
-    "montecarlo": ("ji.monte_carlo", "ji.plot.monte_carlo", "ji.read_study('study.toml')"),
+    "montecarlo": (
+        "ji.monte_carlo",
+        "ji.plot.monte_carlo",
+        "ji.read_study('study.toml')",
+    ),
     "methods": ("ji.compare", "ji.plot.comparison"),
     "theory": ("ji.theory.gap_scale", "ji.plot.admissible_set"),
 }
@@ -340,7 +361,9 @@ def rooms_that_stand_on(room):
     """The room, and all whose files import it, directly or not."""
     uses = {x: set() for x in STOREY}
     for module, path in modules().items():
-        uses[room_of(module)] |= {room_of(imported) for imported, _, _ in imports_of(path)}
+        uses[room_of(module)] |= {
+            room_of(imported) for imported, _, _ in imports_of(path)
+        }
     found = {room}
     while more := {x for x in uses if uses[x] & found} - found:
         found |= more
@@ -356,7 +379,9 @@ def test_a_room_can_be_left_out(room, tmp_path):
     shutil.rmtree(copy / room)
     (tmp_path / "study.toml").write_text(STUDY.format(table=TABLES.get(room, "data")))
     gone = rooms_that_stand_on(room)
-    left = sorted(m for m in modules() if room_of(m) not in gone and not m.endswith("__main__"))
+    left = sorted(
+        m for m in modules() if room_of(m) not in gone and not m.endswith("__main__")
+    )
     asked = "".join(f"lambda: {each}, " for each in ASKED[room])
     script = LEFT_OUT.format(folder=str(tmp_path), modules=left, asked=asked)
     run = {"capture_output": True, "text": True, "cwd": tmp_path, "check": False}
@@ -365,4 +390,6 @@ def test_a_room_can_be_left_out(room, tmp_path):
     restitution, *said = done.stdout.splitlines()
     assert restitution == "0.5"
     assert len(said) == len(ASKED[room])
-    assert all(f"needs the room jimpact/{room}, which is missing here" in line for line in said)
+    assert all(
+        f"needs the room jimpact/{room}, which is missing here" in line for line in said
+    )

@@ -16,8 +16,23 @@ TESTS = Path(__file__).parents[1]
 PACKAGE = TESTS.parent / "jimpact"
 # a case for each law, method and adjoint; a case is traced in .1 to 1 s
 USUAL = (
-    *("lzb", "lzb plane", "lzb space", "lzb implicit", "gaps", "viscous", "newton pile"),
-    *("moreau", "moreau plane", "moreau four corners", "poisson", "grad lzb plane", "vmap"),
+    *(
+        "lzb",
+        "lzb plane",
+        "lzb space",
+        "lzb implicit",
+        "gaps",
+        "viscous",
+        "newton pile",
+    ),
+    *(
+        "moreau",
+        "moreau plane",
+        "moreau four corners",
+        "poisson",
+        "grad lzb plane",
+        "vmap",
+    ),
     *("grad lzb implicit", "history", "motion by events", "motion by contact forces"),
 )
 
@@ -26,26 +41,47 @@ def checked(*cases, package=PACKAGE):
     path = os.pathsep.join(map(str, (package.parent, TESTS / "bodies")))
     command = [sys.executable, str(TESTS / "rules" / "checked_shapes.py"), *cases]
     return subprocess.run(
-        command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False
+        command,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
-@pytest.mark.parametrize("cases", [USUAL, pytest.param((), marks=pytest.mark.release)], ids=len)
+@pytest.mark.parametrize(
+    "cases", [USUAL, pytest.param((), marks=pytest.mark.release)], ids=len
+)
 def test_arrays_have_the_shapes_that_signatures_state(cases):
     done = checked(*cases)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 WRONG = [
-    ("numerics/discs.py", 'length: Float[Array, "m #N"]', 'length: Float[Array, "N m"]', "over"),
-    ("events/run.py", 'rows: Float[Array, "3 m B"]', 'rows: Float[Array, "m B"]', "Rest.rows"),
+    (
+        "numerics/discs.py",
+        'length: Float[Array, "m #N"]',
+        'length: Float[Array, "N m"]',
+        "over",
+    ),
+    (
+        "events/run.py",
+        'rows: Float[Array, "3 m B"]',
+        'rows: Float[Array, "m B"]',
+        "Rest.rows",
+    ),
     (
         "events/slip.py",
         'rate: Float[Array, "m 2 B"]',
         'rate: Float[Array, "m B"]',
         "SlipRates.rate",
     ),
-    ("events/contact_flow.py", 'tolerance: Float[Array, "1 B"]', "tolerance: float", "ContactFlow"),
+    (
+        "events/contact_flow.py",
+        'tolerance: Float[Array, "1 B"]',
+        "tolerance: float",
+        "ContactFlow",
+    ),
 ]
 
 

@@ -54,7 +54,16 @@ def site(tmp_path_factory):
     except ImportError:
         lacking("Sphinx (pip install '.[docs]')")
     out = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", ROOT / "docs", out]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        ROOT / "docs",
+        out,
+    ]
     done = subprocess.run([str(x) for x in command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return out
@@ -65,7 +74,12 @@ class Page(HTMLParser):
 
     def __init__(self, path):
         super().__init__()
-        self.links, self.loads, self.anchors, self.without_words = [], [], {"", "top"}, []
+        self.links, self.loads, self.anchors, self.without_words = (
+            [],
+            [],
+            {"", "top"},
+            [],
+        )
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attributes):
@@ -89,7 +103,9 @@ def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site):
         name = path.relative_to(site)
         for target in page.links + page.loads:
             parts = urlsplit(target)
-            if parts.scheme in ("data", "mailto") or (target in page.links and parts.netloc):
+            if parts.scheme in ("data", "mailto") or (
+                target in page.links and parts.netloc
+            ):
                 continue
             if parts.netloc:
                 wrong.append(f"{name} loads {target}")
@@ -106,14 +122,20 @@ def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site):
 
 def test_what_is_public_is_in_the_site(site):
     """Every public name in the API or on its law's page; every law has a page and a picture."""
-    anchors = set().union(*(Page(x).anchors for x in (site / "generated").rglob("*.html")))
+    anchors = set().union(
+        *(Page(x).anchors for x in (site / "generated").rglob("*.html"))
+    )
     inner = ("data", "plot", "theory", "tracks", "__version__")
-    missing = [x for x in ji.__all__ if x not in inner and f"jimpact.{x}" not in anchors]
+    missing = [
+        x for x in ji.__all__ if x not in inner and f"jimpact.{x}" not in anchors
+    ]
     missing += [f"{part.__name__}.{x}" for part in (ji.plot, ji.theory, ji.data, ji.tracks) for x in part.__all__
                 if f"{part.__name__}.{x}" not in anchors]  # fmt: skip
     assert not missing
     for name, row in ji.REGISTRY.items():
-        page = (site / "generated" / "laws" / f"{name}.html").read_text(encoding="utf-8")
+        page = (site / "generated" / "laws" / f"{name}.html").read_text(
+            encoding="utf-8"
+        )
         assert row.law.__name__ in page
         assert f"law_{name}.png" in page
         assert "<math" in page
@@ -142,7 +164,8 @@ def test_every_picture_of_the_docs_has_its_code():
 
 def test_paper_cites_what_it_lists():
     paper, listed = (
-        (ROOT / "docs" / x).read_text(encoding="utf-8") for x in ("paper.md", "paper.bib")
+        (ROOT / "docs" / x).read_text(encoding="utf-8")
+        for x in ("paper.md", "paper.bib")
     )
     cited = set(re.findall(r"@([a-z]+\d{4})", paper))
     assert cited == set(re.findall(r"@\w+\{(\w+),", listed))
@@ -154,7 +177,12 @@ def test_formulas_of_docstrings_become_formulas(monkeypatch):
     import formulas
 
     assert doctest.testmod(formulas).failed == 0
-    lines = ["Equation: `gamma+ = -e gamma-`, by `ji.impact`", "and `W p`.", "", "`W p`"]
+    lines = [
+        "Equation: `gamma+ = -e gamma-`, by `ji.impact`",
+        "and `W p`.",
+        "",
+        "`W p`",
+    ]
     formulas.typeset(lines)
     assert lines[0].count(":math:") == 2
     assert lines[-1] == "`W p`"
@@ -202,7 +230,12 @@ def browser(tmp_path_factory):
 
 def width(browser, pixels):
     """As a phone's screen: windows of a headless browser do not become that narrow."""
-    size = {"width": pixels, "height": 844, "deviceScaleFactor": 1, "mobile": pixels <= PHONE}
+    size = {
+        "width": pixels,
+        "height": 844,
+        "deviceScaleFactor": 1,
+        "mobile": pixels <= PHONE,
+    }
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
 
 
@@ -226,15 +259,20 @@ def test_pages_open_without_errors_wide_and_narrow(address, site, browser):
         name = path.relative_to(site)
         width(browser, 1280)
         browser.get(f"{address}/{name}")
-        said = [x["message"] for x in browser.get_log("browser") if x["level"] in ERRORS]
+        said = [
+            x["message"] for x in browser.get_log("browser") if x["level"] in ERRORS
+        ]
         wrong += [f"{name}: {x}" for x in [*said, *browser.execute_script(BROKEN)]]
         for pixels in (1280, PHONE):
             width(browser, pixels)
             flat = browser.execute_script(FORMULAS)
             wrong += [
-                f"{name} at {pixels}: too wide: {x}" for x in browser.execute_script(TOO_WIDE)
+                f"{name} at {pixels}: too wide: {x}"
+                for x in browser.execute_script(TOO_WIDE)
             ]
-            wrong += [f"{name} at {pixels}: {flat} formulas do not show"] if flat else []
+            wrong += (
+                [f"{name} at {pixels}: {flat} formulas do not show"] if flat else []
+            )
         assert browser.title, name
     assert not wrong, "\n".join(wrong[:30])
 
@@ -246,7 +284,12 @@ PLATE = """return [...document.querySelectorAll('article img')].map(i =>
 def test_pictures_lie_on_a_light_plate_in_the_dark(address, browser):
     dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", dark)
-    for page in ("index", "motions", "generated/gallery", "generated/notebooks/00_five_minutes"):
+    for page in (
+        "index",
+        "motions",
+        "generated/gallery",
+        "generated/notebooks/00_five_minutes",
+    ):
         browser.get(f"{address}/{page}.html")
         page_colour = browser.execute_script(
             "return getComputedStyle(document.body).backgroundColor"

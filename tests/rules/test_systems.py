@@ -11,7 +11,9 @@ def claimed(name):
     """The closed forms that a law claims, by name."""
     systems = {key: system for key, system in SYSTEMS.items() if name in system.laws}
     if not systems:
-        pytest.skip(f"{name} is in `laws` of no closed form (tests/rules/closed_forms.py)")
+        pytest.skip(
+            f"{name} is in `laws` of no closed form (tests/rules/closed_forms.py)"
+        )
     return systems
 
 
@@ -35,7 +37,10 @@ def test_outcomes(name):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW_SLOPES else []) for x in LAWS],
+    [
+        pytest.param(x, marks=[pytest.mark.slow] if x in SLOW_SLOPES else [])
+        for x in LAWS
+    ],
 )
 def test_slopes(name):
     """dv+ by velocities, restitution, stiffness, exponent: forward and reverse, exact slopes."""

@@ -25,11 +25,17 @@ def names_in_stub(package):
     found = {}
     for node in stub.body:
         if isinstance(node, ast.ImportFrom):
-            assert node.level == 1 or package in (ji.plot, ji.theory), "names of other rooms"
+            assert node.level == 1 or package in (ji.plot, ji.theory), (
+                "names of other rooms"
+            )
             base = [package.__name__] * node.level
             for alias in node.names:
-                assert alias.asname == alias.name, "without `as` a name of a stub is private"
-                found[alias.name] = ".".join([*base, node.module] if node.module else base)
+                assert alias.asname == alias.name, (
+                    "without `as` a name of a stub is private"
+                )
+                found[alias.name] = ".".join(
+                    [*base, node.module] if node.module else base
+                )
     return found
 
 
@@ -73,13 +79,24 @@ def test_unknown_names_are_attribute_errors():
 
 @pytest.mark.slow
 def test_mypy_sees_names_signatures_and_fields():
-    command = [sys.executable, "-m", "mypy", "--config-file", "pyproject.toml", str(SCRIPT)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--config-file",
+        "pyproject.toml",
+        str(SCRIPT),
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.release
-@pytest.mark.skipif(find_spec("basedpyright") is None, reason="basedpyright is not installed")
+@pytest.mark.skipif(
+    find_spec("basedpyright") is None, reason="basedpyright is not installed"
+)
 def test_pyright_sees_names_signatures_and_fields(tmp_path):
     """By basedpyright, which is pyright with a node of its own: nothing is downloaded."""
     reported = {
@@ -92,7 +109,9 @@ def test_pyright_sees_names_signatures_and_fields(tmp_path):
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(reported))
     command = [sys.executable, "-m", "basedpyright", "--project", str(tmp_path)]
     command += ["--pythonpath", sys.executable]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -22,7 +22,9 @@ def test_contact_for_a_law_of_ones_own():
     contact = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
     p = ji.Moreau(0.5).impulses(contact).normal
     np.testing.assert_allclose(p, [1.0, 0.5])
-    np.testing.assert_allclose(contact.gap_velocity_after(p, None), [0.5, 0.0], atol=1e-15)
+    np.testing.assert_allclose(
+        contact.gap_velocity_after(p, None), [0.5, 0.0], atol=1e-15
+    )
     assert contact.tangents == 0
     np.testing.assert_allclose(contact.energy_change(p), -0.25)
     np.testing.assert_allclose(contact.kinetic_angles[0, 1], np.pi / 3)

@@ -75,7 +75,9 @@ def folder(tmp_path_factory):
     (place / "study.toml").write_text(STUDY)
     after = np.asarray(ji.impact(ji.Newton(0.55), PAIR, V).velocity)
     row = f"1,0,{after[0]},{after[1]}\n"
-    (place / "shots.csv").write_text("pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n" + row + row)
+    (place / "shots.csv").write_text(
+        "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n" + row + row
+    )
     import_laws("my_laws.py", place)
     yield place
     for name in ("sluggish", "needy"):
@@ -89,7 +91,9 @@ def law(folder):
 
 def test_declared_domains(law):
     kind = type(law)
-    with pytest.raises(ValueError, match=r"`loss` must lie in \[0, 0.5\], but has value 0.6"):
+    with pytest.raises(
+        ValueError, match=r"`loss` must lie in \[0, 0.5\], but has value 0.6"
+    ):
         kind(0.8, 0.6)
     with pytest.raises(ValueError, match=r"`hardness` must lie in \(0, inf\)"):
         kind(0.8, hardness=0.0)
@@ -110,7 +114,9 @@ def test_study_fit_and_monte_carlo(folder):
     assert found.names == ("loss",)
     np.testing.assert_allclose(found.value, 0.25, atol=1e-9)
     assert found.bounds[1].tolist() == [0.5]
-    hard = ji.fit(found.law, PAIR, study.experiments, free=("loss", "hardness"), starts=1)
+    hard = ji.fit(
+        found.law, PAIR, study.experiments, free=("loss", "hardness"), starts=1
+    )
     assert hard.rank == 1
     assert hard.bounds[0][1] == 2e-4  # fitted in its logarithm
     sampled = ji.monte_carlo(**study.monte_carlo)

@@ -41,7 +41,9 @@ def test_numbers_by_others(case):
     assert not wrong, wrong
     # the committed page: the same words, digits and sources; errors to within a power of ten
     reported = re.search(rf"## {re.escape(case.title)}\n.*?(?=\n## |\Z)", TEXT, re.S)
-    assert reported, f"docs/validation.md lacks {case.title!r}: run python tests/validation/page.py"
+    assert reported, (
+        f"docs/validation.md lacks {case.title!r}: run python tests/validation/page.py"
+    )
     written = reported.group().strip().splitlines()
     given = "\n".join(page.lines(case, rows)).strip().splitlines()
     assert len(written) == len(given)
@@ -74,14 +76,18 @@ def test_tosses_of_the_cube_stay_together():
     assert group[0] == group[2] == group[3]
     assert len(set(group)) == 3
     draws = cube.resampled(toss)
-    assert all(np.sum(draw == 0) == np.sum(draw == 2) == np.sum(draw == 3) for draw in draws)
+    assert all(
+        np.sum(draw == 0) == np.sum(draw == 2) == np.sum(draw == 3) for draw in draws
+    )
 
 
 def test_differences_of_the_cube_are_paired():
     """One law that is .5 % worse in every impact is so in every draw, however they scatter."""
     error, toss = 5 * np.random.default_rng(0).random(40), np.arange(40) // 2
     draws = cube.resampled(toss)
-    np.testing.assert_allclose(cube.difference(error, error + 0.5, draws), 0.5, atol=1e-12)
+    np.testing.assert_allclose(
+        cube.difference(error, error + 0.5, draws), 0.5, atol=1e-12
+    )
     median, low, high = cube.median_and_interval(error, draws)
     assert low < median == np.median(error) < high
 
@@ -91,7 +97,9 @@ def test_scatter_of_the_cube_is_found_with_its_tails(nu):
     """Simulated impacts with a known scatter, normal and with tails: regions hold what they say."""
     rng, many = np.random.default_rng(0), 300
     slopes, noise = rng.normal(size=(many, 6, 2)), np.full((many, 6), 0.01)
-    residual = np.einsum("kij,kj->ki", slopes, rng.normal(size=(many, 2)) * [0.04, 0.02])
+    residual = np.einsum(
+        "kij,kj->ki", slopes, rng.normal(size=(many, 2)) * [0.04, 0.02]
+    )
     residual += 1.5 * noise * rng.normal(size=(many, 6))
     residual *= np.sqrt(nu / rng.chisquare(nu, many))[:, None]
     sizes, inside = cube.scatter_of(residual, slopes, noise, np.arange(many))
@@ -104,9 +112,13 @@ def test_scatter_of_the_cube_is_found_with_its_tails(nu):
 def test_pages_name_the_command_of_their_figures():
     """Each function of `figures.py` has its page, which names it; no page names another one."""
     for name, made in figures.FIGURES.items():
-        text = (page.PAGE.parent / made.__doc__.split(":")[0]).read_text(encoding="utf-8")
+        text = (page.PAGE.parent / made.__doc__.split(":")[0]).read_text(
+            encoding="utf-8"
+        )
         assert f"`python tests/validation/figures.py {name}`" in text, name
-    pages = "".join(path.read_text(encoding="utf-8") for path in page.PAGE.parent.glob("*.md"))
+    pages = "".join(
+        path.read_text(encoding="utf-8") for path in page.PAGE.parent.glob("*.md")
+    )
     assert {*re.findall(r"figures\.py (\w+)", pages)} <= {*figures.FIGURES}
 
 
@@ -172,14 +184,19 @@ def test_measured_rocking_turns_back():
 def test_flights_of_a_drop_and_their_arcs():
     """A parabola and a spin are found as they are; contacts between flights end them."""
     t = drops.FRAME * np.arange(12)
-    arc = np.stack([0.1 + 0.5 * t, 0.1 - t - drops.GRAVITY / 2 * t**2, 1 - 6.0 * t], axis=1)
+    arc = np.stack(
+        [0.1 + 0.5 * t, 0.1 - t - drops.GRAVITY / 2 * t**2, 1 - 6.0 * t], axis=1
+    )
     at = drops.state(arc, 10)
     tenth = 10 * drops.FRAME
     np.testing.assert_allclose(at[0], arc[10], atol=1e-12)
-    np.testing.assert_allclose(at[1], [0.5, -1 - drops.GRAVITY * tenth, -6.0], atol=1e-9)
+    np.testing.assert_allclose(
+        at[1], [0.5, -1 - drops.GRAVITY * tenth, -6.0], atol=1e-9
+    )
     rests = np.tile([0.0, drops.SIDE / 2, 0.0], (5, 1))
     assert (
-        drops.flights(np.concatenate([rests, rests + np.array([0, 0.1, 0]), rests])) == []
+        drops.flights(np.concatenate([rests, rests + np.array([0, 0.1, 0]), rests]))
+        == []
     )  # too short
     long = np.tile([0.0, 0.1, 0.0], (9, 1))
     assert drops.flights(np.concatenate([rests, long, rests, long])) == [
@@ -189,7 +206,13 @@ def test_flights_of_a_drop_and_their_arcs():
 
 def test_the_page_of_the_drops_has_its_rows():
     text = drops.PAGE.read_text(encoding="utf-8")
-    for name in ("jimpact", "MuJoCo", "first flight", "flight after an impact", "an edge"):
+    for name in (
+        "jimpact",
+        "MuJoCo",
+        "first flight",
+        "flight after an impact",
+        "an edge",
+    ):
         assert f"| {name}" in text
     with np.load(drops.NUMBERS) as stored:
         assert {"first flight, jimpact", "first flight, MuJoCo"} <= set(stored.files)
@@ -199,7 +222,9 @@ def test_the_page_of_the_drops_has_its_rows():
 def test_coverage_of_a_few_data_sets():
     """The table is made; the rest of it was made with 500 data sets a row."""
     honest = [row for row in simulated.HONEST if row.what.startswith("Newton, 2")]
-    spoiled = [row for row in simulated.SPOILED if row.expected == "No contact approaches"]
+    spoiled = [
+        row for row in simulated.SPOILED if row.expected == "No contact approaches"
+    ]
     text = simulated.page(40, honest, spoiled, ratios=(), print=lambda *line: None)
     inside = float(re.search(r"e = .8 \| ([\d.]+) \|", text).group(1))
     assert 85 <= inside <= 100

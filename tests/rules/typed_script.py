@@ -24,7 +24,9 @@ assert_type(ji.Newton(0.5, friction=[0.1, 0.2]).restitution, jax.Array)
 assert_type(ji.Moreau([0.5, 0.6], friction=0.3).friction, jax.Array | None)
 assert_type(ji.RestitutionMatrix([[0.1, 0.0], [0.8, 0.5]]).matrix, jax.Array)
 assert_type(ji.Poisson(0.5).restitution, jax.Array)
-assert_type(ji.Binary(np.array([0.5, 0.9]), order="earliest").order, str | tuple[int, ...])
+assert_type(
+    ji.Binary(np.array([0.5, 0.9]), order="earliest").order, str | tuple[int, ...]
+)
 assert_type(ji.Compliant(ji.KelvinVoigt(1e9, 10.0)).force, ji.Force)
 assert_type(out.status, jax.Array)
 assert_type(ji.raise_on_failure(out), ji.Impact)
@@ -40,10 +42,15 @@ assert_type(fit.law.restitution, jax.Array)
 assert_type(fit.standard_error, np.ndarray)
 assert_type(fit.warnings, tuple[str, ...])
 
-found = ji.monte_carlo(law, cradle, [1.0, 0.0, 0.0], gaps=ji.Uniform(0.0, 1e-5), samples=100)
+found = ji.monte_carlo(
+    law, cradle, [1.0, 0.0, 0.0], gaps=ji.Uniform(0.0, 1e-5), samples=100
+)
 assert_type(found, MonteCarlo)
 assert_type(ji.compare(cradle, [1.0, 0.0, 0.0]).velocity, np.ndarray)
-assert_type(ji.simulate(ji.System(ji.Column([1.0]), gravity=True), law, [1.0], [0.0], 1.0), Motion)
+assert_type(
+    ji.simulate(ji.System(ji.Column([1.0]), gravity=True), law, [1.0], [0.0], 1.0),
+    Motion,
+)
 
 # name spaces
 assert_type(ji.plot.fit(fit), Figure)

@@ -18,7 +18,9 @@ def test_a_fit_is_read_and_saved_by_public_names(tmp_path):
     np.testing.assert_allclose(
         fit.value, [0.8912947587740866, 0.8102045696860172, 2.088638444090552]
     )
-    assert fit.verdict.startswith("restitution[1] and restitution[2] and the stiffness ratio")
+    assert fit.verdict.startswith(
+        "restitution[1] and restitution[2] and the stiffness ratio"
+    )
     again = fit.save(tmp_path / "fit.json")
     assert str(ji.load(again)) == str(fit)
     assert "jimpact." not in json.dumps(json.loads(again.read_text())["result"])
@@ -32,7 +34,9 @@ def test_a_motion_is_read():
 def test_a_run_is_not_continued(tmp_path):
     """Its identity named modules, so that nobody can tell whether it is the same."""
     folder = shutil.copytree(SAVED, tmp_path / "run")
-    with pytest.raises(ValueError, match="holds a run that an earlier build of jimpact began"):
+    with pytest.raises(
+        ValueError, match="holds a run that an earlier build of jimpact began"
+    ):
         ji.monte_carlo(
             ji.Compliant(ji.Hertz(1e9)), ji.chain([0.1] * 3), [1.0, 0, 0],
             gaps=ji.Uniform(0.0, 1e-5), samples=1000, folder=folder,
@@ -53,7 +57,9 @@ def test_a_robust_fit_is_read_as_it_was_saved(tmp_path, loss):
     after = before + np.outer(1.7 * (before[:, 0] - before[:, 1]) / 2, [-1, 1])
     after[2] += 0.3  # an outlier
     data = ji.Experiments(before, after, sigma=0.01)
-    fit = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data, search=ji.Search(loss=loss))
+    fit = ji.fit(
+        ji.Newton(0.5), ji.chain([1.0, 1.0]), data, search=ji.Search(loss=loss)
+    )
     again = ji.load(fit.save(tmp_path / "fit.json"))
     assert str(again) == str(fit)
     np.testing.assert_array_equal(again.standard_error, fit.standard_error)

@@ -47,7 +47,9 @@ def test_a_saved_fit_is_the_same_fit(tmp_path, options):
     # the weights of the saved problem come from another program: rounding of a few products
     residuals = [x.problem.residual([0.7]) for x in (again, found)]
     np.testing.assert_allclose(*residuals, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(again.predict(SHOTS).low, found.predict(SHOTS).low, rtol=1e-12)
+    np.testing.assert_allclose(
+        again.predict(SHOTS).low, found.predict(SHOTS).low, rtol=1e-12
+    )
     record = json.loads(path.read_text())
     assert record["versions"]["jax"] == jax.__version__
     law = record["result"]["law"]
@@ -60,7 +62,10 @@ def test_a_saved_fit_is_the_same_fit(tmp_path, options):
         path.write_text(json.dumps(record | change))
         with pytest.raises(ValueError, match=message):
             ji.load(path)
-    for text, message in (("[1]", "has no `format`"), ("e = 0.9", "a saved fit .JSON., but")):
+    for text, message in (
+        ("[1]", "has no `format`"),
+        ("e = 0.9", "a saved fit .JSON., but"),
+    ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             ji.load(path)

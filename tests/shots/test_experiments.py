@@ -33,7 +33,9 @@ def written(tmp_path, text, encoding="utf-8"):
 def test_units(tmp_path, unit, factor):
     path = written(tmp_path, f"pre_1[m/s],post_1[{unit}],sigma_1[{unit}]\n1,-2,0.5\n")
     data = ji.read_experiments(path)
-    np.testing.assert_allclose([data.pre[0, 0], data.post[0, 0]], [1, -2 * factor], rtol=1e-15)
+    np.testing.assert_allclose(
+        [data.pre[0, 0], data.post[0, 0]], [1, -2 * factor], rtol=1e-15
+    )
     np.testing.assert_allclose(data.sigma[0, 0], 0.5 * factor, rtol=1e-15)
 
 
@@ -51,13 +53,19 @@ def test_turning_keeps_its_unit(tmp_path):
     data = ji.read_experiments(written(tmp_path, head + "1,180,1,2\n"))
     assert data.units == ("m/s", "rad/s")
     np.testing.assert_allclose(data.pre, [[1.0, np.pi]])
-    with pytest.raises(ValueError, match=r"all columns of velocity 2 must be in m/s or all in rad"):
-        ji.read_experiments(written(tmp_path, head.replace("rad/s", "m/s") + "1,180,1,2\n"))
+    with pytest.raises(
+        ValueError, match=r"all columns of velocity 2 must be in m/s or all in rad"
+    ):
+        ji.read_experiments(
+            written(tmp_path, head.replace("rad/s", "m/s") + "1,180,1,2\n")
+        )
 
 
 def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
-    with pytest.warns(UserWarning, match=r"line 4, column `post_2 \[m/s\]`: the cell is NaN"):
+    with pytest.warns(
+        UserWarning, match=r"line 4, column `post_2 \[m/s\]`: the cell is NaN"
+    ):
         data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal(data.pre, [[2, 0], [2, 0]])
     np.testing.assert_array_equal(data.post, [[1, np.nan], [1, np.nan]])
@@ -66,7 +74,9 @@ def test_missing_values_labels_and_foreign_line_ends(tmp_path):
 
 
 def test_comments_are_not_read(tmp_path):
-    text = "comment,pre_1[m/s],comment_camera,post_1[m/s]\nfirst,1,left of it,0.5\n,2,,1\n"
+    text = (
+        "comment,pre_1[m/s],comment_camera,post_1[m/s]\nfirst,1,left of it,0.5\n,2,,1\n"
+    )
     data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal([data.pre, data.post], [[[1], [2]], [[0.5], [1]]])
     with pytest.raises(ValueError, match="must have 4 values"):
@@ -74,8 +84,12 @@ def test_comments_are_not_read(tmp_path):
 
 
 def test_data_sets_are_joined():
-    plain = ji.Experiments([1.0, 0.0], [0.1, np.nan], sigma=0.01, shots=["a"], lost_freedom=1)
-    read = ji.Experiments([[2.0, 0.0]] * 2, [[0.2, 1.8]] * 2, resolution=0.1, sigma_pre=0.02)
+    plain = ji.Experiments(
+        [1.0, 0.0], [0.1, np.nan], sigma=0.01, shots=["a"], lost_freedom=1
+    )
+    read = ji.Experiments(
+        [[2.0, 0.0]] * 2, [[0.2, 1.8]] * 2, resolution=0.1, sigma_pre=0.02
+    )
     both = plain + read
     assert both.shots == ("a", "1", "2")
     np.testing.assert_array_equal(both.pre, [[1, 0], [2, 0], [2, 0]])
@@ -91,7 +105,10 @@ def test_data_sets_are_joined():
     assert len(ji.Experiments.join([placed, placed, placed]).scenes) == 3
     turning = ji.Experiments([1.0, 0.0], [0.1, 0.9], 0.01, units=["m/s", "rad/s"])
     for other, message in (
-        (ji.Experiments([1.0, 0.0], [0.1, 0.9]), "a `sigma` .or `resolution`. in all or in none"),
+        (
+            ji.Experiments([1.0, 0.0], [0.1, 0.9]),
+            "a `sigma` .or `resolution`. in all or in none",
+        ),
         (placed, "scenes of their own in all or in none"),
         (turning, "the same units"),
         (ji.Experiments([1.0], [0.1], 0.01), "as many bodies"),
@@ -176,7 +193,9 @@ def test_correction_is_the_smallest_change_in_units_of_sigma():
     # Lagrange: change_i proportional to sigma_i^2 m_i, momentum excess 0.6 removed
     share = np.array([0.01 * 1.0, 0.09 * 2.0])
     expected = np.array([0.0, 1.8]) - 0.6 * share / (share @ [1.0, 2.0])
-    np.testing.assert_allclose(data.momentum_corrected(scene).post[0], expected, atol=1e-14)
+    np.testing.assert_allclose(
+        data.momentum_corrected(scene).post[0], expected, atol=1e-14
+    )
 
 
 def test_a_wall_takes_all_momentum_and_two_pairs_conserve_two():
@@ -217,7 +236,9 @@ def test_masses_and_gaps_of_each_shot(tmp_path):
         ji.read_experiments(path)
 
 
-@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("um", 1e-6)])
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("um", 1e-6)]
+)
 def test_units_of_gaps(tmp_path, unit, metres):
     head = MORE.replace("gap_1[mm]", f"gap_1[{unit}]")
     data = ji.read_experiments(
@@ -228,13 +249,19 @@ def test_units_of_gaps(tmp_path, unit, metres):
 
 def test_a_body_where_each_shot_found_it(tmp_path):
     head = "q_1[m],q_2[cm],q_3[deg]," + ",".join(
-        f"{k}_{i}[{u}]" for k in ("pre", "post") for i, u in ((1, "m/s"), (2, "m/s"), (3, "rad/s"))
+        f"{k}_{i}[{u}]"
+        for k in ("pre", "post")
+        for i, u in ((1, "m/s"), (2, "m/s"), (3, "rad/s"))
     )
-    path = written(tmp_path, f"{head}\n0,100,0,0,-1,0,0,0.5,0\n0,100,30,0,-1,0,0,0.5,0\n")
+    path = written(
+        tmp_path, f"{head}\n0,100,0,0,-1,0,0,0.5,0\n0,100,30,0,-1,0,0,0.5,0\n"
+    )
     data = ji.read_experiments(path, ji.Block(width=1.0, height=2.0), near=1e-3)
     assert data.contacts.tolist() == [2, 1]  # its base, its corner
     assert data.units == ("m/s", "m/s", "rad/s")
-    with pytest.raises(ValueError, match=r"columns `q` must belong to a body, but are given for"):
+    with pytest.raises(
+        ValueError, match=r"columns `q` must belong to a body, but are given for"
+    ):
         ji.read_experiments(path, CHAIN)
 
 
@@ -261,4 +288,6 @@ def test_readings_in_steps_have_the_error_of_their_rounding():
     both = ji.Experiments([1.0, 0.0], [0.2, 0.8], sigma=0.03, resolution=0.1)
     np.testing.assert_allclose(both.only([0]).sigma, np.hypot(0.03, 0.1 / np.sqrt(12)))
     rounded = np.random.default_rng(0).uniform(-1, 1, 4000)
-    np.testing.assert_allclose((rounded - rounded.round(1)).std(), 0.1 / np.sqrt(12), rtol=0.02)
+    np.testing.assert_allclose(
+        (rounded - rounded.round(1)).std(), 0.1 / np.sqrt(12), rtol=0.02
+    )

@@ -6,7 +6,11 @@ import numpy as np
 import jimpact as ji
 
 MU = np.array([0.0, 0.3, 1.0])
-CRITICAL = [2**0.5, (8.81**0.5 - 0.9) / 2, 0.5**0.5]  # of these mu; the roots of the two forms
+CRITICAL = [
+    2**0.5,
+    (8.81**0.5 - 0.9) / 2,
+    0.5**0.5,
+]  # of these mu; the roots of the two forms
 BOTH = np.array([0.5, 1.0, 2.0, 3.0, *CRITICAL])
 E = np.array([0.3, 0.8, 0.9, 1.0])
 

@@ -22,7 +22,9 @@ def close(a, b, tolerance=1e-12):
 
 def rigid(inertia, *points):
     """A block above the ground that touches it at x = points; coordinates (x, y, angle)."""
-    return ji.Scene([1.0, 1.0, inertia], [[0] * len(points), [1] * len(points), list(points)])
+    return ji.Scene(
+        [1.0, 1.0, inertia], [[0] * len(points), [1] * len(points), list(points)]
+    )
 
 
 def parts(scene):
@@ -66,10 +68,14 @@ def test_boundary_of_three_equal_balls():
     u = (boundary - THREE.centre) @ THREE.axes  # unit masses
     following = np.roll(u, -1, axis=0)
     area = 0.5 * np.sum(u[:, 0] * following[:, 1] - u[:, 1] * following[:, 0])
-    close(area, 0.5 * (2 / 3) * np.pi / 3, 1e-4)  # a sector of 60 degrees, counter-clockwise
+    close(
+        area, 0.5 * (2 / 3) * np.pi / 3, 1e-4
+    )  # a sector of 60 degrees, counter-clockwise
     beyond = THREE.centre + 1.001 * (boundary - THREE.sample(0, 500).mean(axis=0))
     assert THREE.contains(boundary).all()
-    assert not THREE.contains(beyond + THREE.sample(0, 500).mean(axis=0) - THREE.centre).any()
+    assert not THREE.contains(
+        beyond + THREE.sample(0, 500).mean(axis=0) - THREE.centre
+    ).any()
 
 
 def test_arc_of_unequal_balls_ends_where_a_contact_stays_closed():
@@ -246,7 +252,9 @@ def test_contains_agrees_with_the_definition():
         after = v + p @ np.linalg.solve(mass, normals).T
         allowed = (p >= 0).all(1) & (after @ normals >= 0).all(1)
         allowed &= energy(scene, after) <= energy(scene, v)
-        assert (found.contains(after, 1e-12) == allowed).mean() > 0.995  # but for rounding
+        assert (
+            found.contains(after, 1e-12) == allowed
+        ).mean() > 0.995  # but for rounding
         for outcome in (True, False):
             seen[outcome] += int((allowed == outcome).sum())
     assert min(seen.values()) > 300
@@ -257,7 +265,10 @@ def test_contains_wants_the_momentum_balance():
     assert not THREE.contains([0.0, 0.25, 0.7])
     assert not THREE.contains(V)
     assert THREE.contains([0.0, 0.25, 0.7], tolerance=0.1)
-    assert THREE.contains(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.01]])).tolist() == [True, False]
+    assert THREE.contains(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.01]])).tolist() == [
+        True,
+        False,
+    ]
 
 
 @pytest.mark.slow
@@ -266,9 +277,9 @@ def test_outcomes_of_laws_lie_inside():
     v = jnp.array([1.0, 0.2, 0.1, -0.5])
     sets = [admissible_set(ji.chain(m), v) for m in masses]
     for law in (ji.Newton(0.0), ji.Newton(0.5), ji.Newton(1.0), ji.LZB(0.8)):
-        after = jax.jit(jax.vmap(lambda m, law=law: ji.impact(law, ji.chain(m), v).velocity))(
-            masses
-        )
+        after = jax.jit(
+            jax.vmap(lambda m, law=law: ji.impact(law, ji.chain(m), v).velocity)
+        )(masses)
         assert all(found.contains(outcome) for found, outcome in zip(sets, after))
 
 
@@ -279,7 +290,9 @@ def test_samples_are_uniform_and_repeatable():
     assert (samples != THREE.sample(4, 3000)).any()
     gamma = np.diff(samples, axis=1)
     share = 2 * (energy(BALLS, samples) - 1 / 6) / (2 / 3)
-    angle = np.arctan2(np.sqrt(3) / 2 * gamma[:, 0], gamma[:, 1] + 0.5 * gamma[:, 0]) / (np.pi / 3)
+    angle = np.arctan2(
+        np.sqrt(3) / 2 * gamma[:, 0], gamma[:, 1] + 0.5 * gamma[:, 0]
+    ) / (np.pi / 3)
     for values in (share, angle):
         ordered = np.sort(values)
         distance = np.abs(ordered - (np.arange(3000) + 0.5) / 3000).max()
@@ -287,7 +300,9 @@ def test_samples_are_uniform_and_repeatable():
     assert abs(np.corrcoef(share, angle)[0, 1]) < 0.06
 
 
-@pytest.mark.parametrize("masses", [[1e-6, 1.0, 1e6], [1e6, 1.0, 1e-6], [1.0, 1e-6, 1.0]])
+@pytest.mark.parametrize(
+    "masses", [[1e-6, 1.0, 1e6], [1e6, 1.0, 1e-6], [1.0, 1e-6, 1.0]]
+)
 def test_mass_ratios(masses):
     scene = ji.chain(masses)
     found = admissible_set(scene, V)
@@ -302,7 +317,9 @@ def test_mass_ratios(masses):
 
 
 def test_float32_scene():
-    found = admissible_set(ji.chain(jnp.ones(3, jnp.float32)), jnp.array(V, jnp.float32))
+    found = admissible_set(
+        ji.chain(jnp.ones(3, jnp.float32)), jnp.array(V, jnp.float32)
+    )
     close(found.conserving_arc(2), [[0, 0, 1], [-1 / 3, 2 / 3, 2 / 3]], 1e-6)
     out = ji.impact(ji.Newton(jnp.float32(0.9)), found.scene, jnp.array(V, jnp.float32))
     assert out.velocity.dtype == jnp.float32
@@ -311,7 +328,10 @@ def test_float32_scene():
 
 def test_in_words():
     text = str(THREE).splitlines()
-    assert text[0] == "closed contacts: 2, approaching: 1; admissible outcomes of dimension 2"
+    assert (
+        text[0]
+        == "closed contacts: 2, approaching: 1; admissible outcomes of dimension 2"
+    )
     assert text[1].split()[2:4] == ["0.166667", "J"]
     assert [float(x) for x in text[3].split()] == [1, 1, -0.333333, 0.333333, 0.333333]
     assert text[-2:] == [
@@ -323,9 +343,18 @@ def test_in_words():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: admissible_set(BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
-        (lambda: admissible_set(BALLS, [1.0, np.nan, 0.0]), r"`velocity`.*nan at index 1"),
-        (lambda: THREE.contains([1.0, 0.0]), r"`velocity` must have shape \(3,\) or \(k, 3\)"),
+        (
+            lambda: admissible_set(BALLS, [1.0, 0.0]),
+            r"`velocity` must have shape \(3,\)",
+        ),
+        (
+            lambda: admissible_set(BALLS, [1.0, np.nan, 0.0]),
+            r"`velocity`.*nan at index 1",
+        ),
+        (
+            lambda: THREE.contains([1.0, 0.0]),
+            r"`velocity` must have shape \(3,\) or \(k, 3\)",
+        ),
         (lambda: THREE.contains([np.inf, 0.0, 0.0]), r"`velocity` must be finite"),
         (lambda: THREE.contains(V, tolerance=-1.0), r"`tolerance`.*-1"),
         (lambda: THREE.sample(0, 0), r"`count` must be an int >= 1, but has value 0"),
@@ -334,11 +363,15 @@ def test_in_words():
         (lambda: THREE.boundary(1), r"`points`.*1"),
         (
             lambda: admissible_set(
-                ji.Scene(np.ones(12), np.random.default_rng(0).normal(size=(12, 24))), -np.ones(12)
+                ji.Scene(np.ones(12), np.random.default_rng(0).normal(size=(12, 24))),
+                -np.ones(12),
             ),
             r"fewer redundant contacts: 24 contacts of rank 12",
         ),
-        (lambda: plot_admissible_set(THREE, {"x": [1.0]}), r"`outcomes`.*'x' has shape \(1,\)"),
+        (
+            lambda: plot_admissible_set(THREE, {"x": [1.0]}),
+            r"`outcomes`.*'x' has shape \(1,\)",
+        ),
     ],
 )
 def test_bad_input(call, message):
@@ -379,7 +412,9 @@ def test_picture_of_two_contacts(tmp_path):
 def test_picture_of_other_numbers_of_contacts():
     for masses, panels in (([1.0, 1.0], 1), (np.ones(4), 3), (np.ones(7), 6)):
         v = np.eye(len(masses))[0]
-        figure = plot_admissible_set(admissible_set(ji.chain(masses), v), {"stays": v}, "title")
+        figure = plot_admissible_set(
+            admissible_set(ji.chain(masses), v), {"stays": v}, "title"
+        )
         visible = [axes for axes in figure.axes if axes.get_visible()]
         assert len(visible) == panels + 1  # and the colour bar
         assert labels(figure) == ["stays (not admissible)"]

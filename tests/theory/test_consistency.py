@@ -31,7 +31,9 @@ def dense(matrix):
 def block(mass=2.0, height=1.0, width=1.5):
     inertia = mass * (height**2 + width**2) / 12
     normals = [[0, 0], [1, 1], [width / 2, -width / 2]]
-    return ji.Scene([mass, mass, inertia], normals, tangents=[[1, 1], [0, 0], [height / 2] * 2])
+    return ji.Scene(
+        [mass, mass, inertia], normals, tangents=[[1, 1], [0, 0], [height / 2] * 2]
+    )
 
 
 def test_largest_size_and_beyond():
@@ -40,7 +42,9 @@ def test_largest_size_and_beyond():
     found = copositivity(q)
     close(found.margin, -4.0)
     close(np.flatnonzero(found.witness), [1, 4, 5, 9])
-    with pytest.raises(ValueError, match=r"`matrix` must have at most 12 rows.*but has 13"):
+    with pytest.raises(
+        ValueError, match=r"`matrix` must have at most 12 rows.*but has 13"
+    ):
         copositivity(np.eye(13))
 
 
@@ -50,7 +54,11 @@ def test_answers_and_tolerance():
     assert copositivity(HORN - 1e-6 * np.eye(5)).answer == "no"
     assert copositivity(HORN - 1e-6 * np.eye(5), tolerance=1e-5).answer == "boundary"
     assert copositivity(1e-12 * np.eye(2), scale=1.0).answer == "boundary"
-    assert [bool(copositivity(s * np.eye(2))) for s in (1, 0, -1)] == [True, True, False]
+    assert [bool(copositivity(s * np.eye(2))) for s in (1, 0, -1)] == [
+        True,
+        True,
+        False,
+    ]
     generator = np.random.default_rng(2)
     a = generator.normal(size=(5, 5))
     assert copositivity(a @ a.T + np.abs(generator.normal(size=(5, 5)))).answer == "yes"
@@ -59,9 +67,15 @@ def test_answers_and_tolerance():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: copositivity(np.ones((2, 3))), r"`matrix` must have shape \(m, m\).*\(2, 3\)"),
+        (
+            lambda: copositivity(np.ones((2, 3))),
+            r"`matrix` must have shape \(m, m\).*\(2, 3\)",
+        ),
         (lambda: copositivity([1.0, 2.0]), r"`matrix`.*\(2,\)"),
-        (lambda: copositivity([[np.nan]]), r"`matrix` must be finite, but has value nan"),
+        (
+            lambda: copositivity([[np.nan]]),
+            r"`matrix` must be finite, but has value nan",
+        ),
         (lambda: copositivity([[1.0]], tolerance=-1.0), r"`tolerance`.*-1"),
         (lambda: copositivity([[1.0]], scale=-2.0), r"`scale`.*-2"),
     ],
@@ -108,7 +122,10 @@ def test_energy_change_expressions():
     xi = plus + e @ qn
     expected = -0.695996894379984858
     close(0.5 * (plus + qn) @ p, expected)
-    close(0.5 * p @ np.linalg.solve(np.eye(2) + e, 2 * xi - (np.eye(2) - e) @ g @ p), expected)
+    close(
+        0.5 * p @ np.linalg.solve(np.eye(2) + e, 2 * xi - (np.eye(2) - e) @ g @ p),
+        expected,
+    )
     # self-adjoint E = G S, corrected (6.50)
     e = g @ np.array([[0.5, 0.1], [0.1, 0.3]])
     expected = -0.735489507379329992
@@ -127,7 +144,9 @@ def test_slender_block_newton_is_kinetically_inconsistent():
     assert found.kinematic.holds
     assert not found.kinetic.holds
     assert not found.admissible
-    p, _ = changes(dense(normalized_delassus(scene)), 0.5 * np.eye(2), found.kinetic.velocity)
+    p, _ = changes(
+        dense(normalized_delassus(scene)), 0.5 * np.eye(2), found.kinetic.velocity
+    )
     close(np.sort(p), [-0.4, 1.6])
     close(found.kinetic.worst, -0.4)
     close(p[found.kinetic.where[0]], -0.4)
@@ -147,7 +166,9 @@ def test_audit_agrees_with_sampled_velocities():
     for k in range(24):
         m = (2, 3)[k % 2]
         scene = random_scene(generator, m)
-        e = generator.uniform(0.3, 1) * np.eye(m) + 0.2 * generator.uniform(-0.2, 1, (m, m))
+        e = generator.uniform(0.3, 1) * np.eye(m) + 0.2 * generator.uniform(
+            -0.2, 1, (m, m)
+        )
         found = audit_matrix(scene, e)
         g = dense(normalized_delassus(scene))
         qn = -np.abs(generator.normal(size=(2000, m)))
@@ -158,7 +179,11 @@ def test_audit_agrees_with_sampled_velocities():
         assert found.kinetic.holds == bool((p >= -1e-12).all())
         # least entries, from the approaches of single contacts
         close(found.kinetic.worst, p[:, -m:].min(), 1e-10)
-        close(p[found.kinetic.where[0], found.kinetic.where[1] - m], p[:, -m:].min(), 1e-10)
+        close(
+            p[found.kinetic.where[0], found.kinetic.where[1] - m],
+            p[:, -m:].min(),
+            1e-10,
+        )
         close(found.kinematic.worst, (-e @ qn[-m:].T).min())
         gain = 0.5 * np.sum((qn - qn @ e.T) * p.T, axis=1) / np.sum(qn**2, axis=1)
         assert -0.5 * found.energetic.margin >= gain.max() - 1e-12
@@ -167,8 +192,16 @@ def test_audit_agrees_with_sampled_velocities():
         pbar = -np.linalg.solve(g, (np.eye(m) + e) @ found.worst_normal_velocity)
         after = v + velocity_change(scene, pbar / kinetic_norm(scene))
         change = kinetic_energy(scene, after) - kinetic_energy(scene, v)
-        close(change, -0.5 * found.energetic.margin, 1e-9 * (1 + abs(found.energetic.margin)))
-        close(ji.theory.normalized_gap_velocity(scene, v), found.worst_normal_velocity, 1e-10)
+        close(
+            change,
+            -0.5 * found.energetic.margin,
+            1e-9 * (1 + abs(found.energetic.margin)),
+        )
+        close(
+            ji.theory.normalized_gap_velocity(scene, v),
+            found.worst_normal_velocity,
+            1e-10,
+        )
         assert (found.energetic.answer == "no") == (change > 1e-7)
         seen[found.energetic.answer] += 1
         seen["fine" if found.kinematic.holds and found.kinetic.holds else "sign"] += 1
@@ -208,7 +241,9 @@ def test_equal_and_unequal_restitution():
     assert audit_matrix(CHAIN, 1.001 * np.eye(2)).energetic.answer == "no"
     assert audit_matrix(CHAIN, 0.999 * np.eye(2)).energetic.answer == "yes"
     assert audit_matrix(CHAIN, np.diag([0.8, 0.4])).spectral is None
-    assert audit_matrix(CHAIN, 0.8 * np.eye(2)).spectral_radius == pytest.approx(0.8, abs=1e-14)
+    assert audit_matrix(CHAIN, 0.8 * np.eye(2)).spectral_radius == pytest.approx(
+        0.8, abs=1e-14
+    )
     decoupled = ji.Scene(np.ones(2), np.eye(2))
     found = audit_matrix(decoupled, np.eye(2))
     assert found.singular_value == found.singular_value_bound == 1.0
@@ -236,7 +271,9 @@ def test_stored_energy_is_not_an_energy_gain():
     scene, v, half = ji.chain([1.0, 1.0]), [0.0, 0.0], jnp.array([0.5])
     for stored, gain in ((0.25, 0.0), (0.2, 0.05)):
         number = jnp.asarray(stored)
-        out = ji.Impact(jnp.array([-0.5, 0.5]), half, half[:0], 0.25 + 0 * number, number, 0)
+        out = ji.Impact(
+            jnp.array([-0.5, 0.5]), half, half[:0], 0.25 + 0 * number, number, 0
+        )
         audit = ji.audit(out, scene, v)
         close(audit.energy_gain, gain / (2 * stored))
         assert audit.broken == (["energetic"] if gain else [])
@@ -245,9 +282,16 @@ def test_stored_energy_is_not_an_energy_gain():
 def test_friction_is_part_of_the_momentum():
     """A particle of 1 kg on the ground: p = 1.5 upwards, friction -0.3 against its slip."""
     scene = ji.Scene([1.0, 1.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
-    v, after, p, zero = [1.0, -1.0], jnp.array([0.7, 0.5]), jnp.array([1.5]), jnp.zeros(())
+    v, after, p, zero = (
+        [1.0, -1.0],
+        jnp.array([0.7, 0.5]),
+        jnp.array([1.5]),
+        jnp.zeros(()),
+    )
     for friction, broken in ((-0.3, []), (0.3, ["momentum"])):
-        out = ji.Impact(after, p, jnp.array([friction]), zero - 0.63, zero, jnp.int32(0))
+        out = ji.Impact(
+            after, p, jnp.array([friction]), zero - 0.63, zero, jnp.int32(0)
+        )
         assert ji.audit(out, scene, v).broken == broken
 
 
@@ -255,7 +299,8 @@ def test_open_contacts_may_approach():
     """Ball 2 flies towards ball 3, which it has not reached."""
     scene, v = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0]
     out = ji.Impact(
-        *(jnp.array(x) for x in ([0.0, 1.0, 0.0], [1.0, 0.0], [0.0][:0], 0.0, 0.0)), jnp.int32(0)
+        *(jnp.array(x) for x in ([0.0, 1.0, 0.0], [1.0, 0.0], [0.0][:0], 0.0, 0.0)),
+        jnp.int32(0),
     )
     assert ji.audit(out, scene, v).broken == []
 
@@ -268,25 +313,40 @@ def test_audit_in_words_and_in_float32():
     assert "not self-adjoint" in text
     assert "conserved for qn- = " in str(audit_matrix(CHAIN, np.eye(2)))
     single = ji.chain(jnp.array([1.0, 2.0, 3.0], jnp.float32))
-    assert audit_matrix(single, jnp.eye(2, dtype=jnp.float32)).energetic.answer == "boundary"
+    assert (
+        audit_matrix(single, jnp.eye(2, dtype=jnp.float32)).energetic.answer
+        == "boundary"
+    )
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: audit_matrix(CHAIN, np.ones((2, 3))), r"`matrix` must have shape \(2, 2\)"),
+        (
+            lambda: audit_matrix(CHAIN, np.ones((2, 3))),
+            r"`matrix` must have shape \(2, 2\)",
+        ),
         (lambda: audit_matrix(CHAIN, [0.5, 0.5]), r"`matrix` must have shape \(2, 2\)"),
-        (lambda: audit_matrix(CHAIN, [[0.5, np.nan], [0, 0]]), r"`matrix`.*nan at index \(0, 1\)"),
+        (
+            lambda: audit_matrix(CHAIN, [[0.5, np.nan], [0, 0]]),
+            r"`matrix`.*nan at index \(0, 1\)",
+        ),
         (lambda: audit_matrix(CHAIN, np.eye(2), tolerance=-1), r"`tolerance`"),
         (
             lambda: audit_matrix(ji.chain([1.0], wall="both"), np.eye(2)),
             r"independent contacts, but its 2 closed contacts have rank 1",
         ),
-        (lambda: audit_matrix(ji.chain([1.0, 1.0], gaps=[1.0]), [[1.0]]), r"closed contact"),
+        (
+            lambda: audit_matrix(ji.chain([1.0, 1.0], gaps=[1.0]), [[1.0]]),
+            r"closed contact",
+        ),
         (lambda: audit_matrix(ji.chain(np.ones(14)), np.eye(13)), r"at most 12 rows"),
         (lambda: carnot_energy_loss(CHAIN, [1.0]), r"`jump` must have shape \(3,\)"),
         (lambda: carnot_energy_loss(CHAIN, [1.0, 0, 0], -0.1), r"`restitution`.*-0\.1"),
-        (lambda: carnot_energy_loss(CHAIN, [1.0, 0, 0], [0.1, 0.2]), r"`restitution`.*shape"),
+        (
+            lambda: carnot_energy_loss(CHAIN, [1.0, 0, 0], [0.1, 0.2]),
+            r"`restitution`.*shape",
+        ),
     ],
 )
 def test_audit_bad_input(call, message):
@@ -380,7 +440,9 @@ def test_friction_bounds_hold_on_random_scenes():
     for _ in range(12):
         a = generator.normal(size=(4, 4))
         scene = ji.Scene(
-            a @ a.T + np.eye(4), generator.normal(size=(4, 2)), generator.normal(size=(4, 2))
+            a @ a.T + np.eye(4),
+            generator.normal(size=(4, 2)),
+            generator.normal(size=(4, 2)),
         )
         e, mu = 0.4 * generator.random((2, 2)), 0.3 * generator.random(2)
         bounds = friction_bounds(scene, e, mu, generator.uniform(-1, 1, 2))
@@ -398,9 +460,9 @@ def test_friction_bounds_hold_on_random_scenes():
         friction = ((g - bounds.g_mu) / np.asarray(normal_columns(scene))).mean(axis=0)
         across = tangential * friction @ np.linalg.solve(bounds.g_mu, np.eye(2) + e)
         qn, qt = generator.normal(size=(500, 2)), generator.normal(size=(500, 2))
-        qt *= (np.linalg.norm(qn, axis=1) / np.linalg.norm(qt, axis=1) / bounds.least_ratio)[
-            :, None
-        ]
+        qt *= (
+            np.linalg.norm(qn, axis=1) / np.linalg.norm(qt, axis=1) / bounds.least_ratio
+        )[:, None]
         change = np.einsum("ki,ij,kj->k", qn, 0.5 * (bounds.k - bounds.m_bar), qn)
         change += np.einsum("ki,ij,kj->k", qt, across, qn)
         assert change.max() <= 1e-12
@@ -419,14 +481,22 @@ def normal_columns(scene):
     ("call", "message"),
     [
         (lambda: friction_bounds(CHAIN, np.eye(2), 0.1), r"planar tangents"),
-        (lambda: friction_bounds(block(), np.eye(3), 0.1), r"`matrix` must have shape \(2, 2\)"),
+        (
+            lambda: friction_bounds(block(), np.eye(3), 0.1),
+            r"`matrix` must have shape \(2, 2\)",
+        ),
         (lambda: friction_bounds(block(), np.eye(2), -0.1), r"`friction`.*-0\.1"),
         (lambda: friction_bounds(block(), np.eye(2), [0.1] * 3), r"`friction`.*\(3,\)"),
         (lambda: friction_bounds(block(), np.eye(2), 0.1, slip=1.5), r"`slip`.*1\.5"),
-        (lambda: friction_energy_change(block(), [0, -1.0, 0], [1.0], [1.0, 0]), r"`impulse`"),
+        (
+            lambda: friction_energy_change(block(), [0, -1.0, 0], [1.0], [1.0, 0]),
+            r"`impulse`",
+        ),
         (
             lambda: friction_bounds(
-                ji.Scene(np.ones(2), [[0.0], [1.0]], [[1.0], [0.0]], gaps=[1.0]), [[0.5]], 0.1
+                ji.Scene(np.ones(2), [[0.0], [1.0]], [[1.0], [0.0]], gaps=[1.0]),
+                [[0.5]],
+                0.1,
             ),
             r"closed contacts only",
         ),

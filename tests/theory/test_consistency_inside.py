@@ -42,8 +42,14 @@ def test_margin_of_two_by_two():
     q = np.random.default_rng(0).normal(size=(500, 2, 2))
     q = q + q.transpose(0, 2, 1)
     a, b, c = q[:, 0, 0], q[:, 0, 1], q[:, 1, 1]
-    lowest = (a + c) / 2 - np.hypot((a - c) / 2, b)  # its eigenvector is positive iff b < 0
-    close(jax.vmap(margin)(jnp.asarray(q))[0], np.where(b < 0, lowest, np.minimum(a, c)), 1e-13)
+    lowest = (a + c) / 2 - np.hypot(
+        (a - c) / 2, b
+    )  # its eigenvector is positive iff b < 0
+    close(
+        jax.vmap(margin)(jnp.asarray(q))[0],
+        np.where(b < 0, lowest, np.minimum(a, c)),
+        1e-13,
+    )
 
 
 def test_margin_is_below_every_sample():

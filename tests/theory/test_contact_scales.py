@@ -37,7 +37,9 @@ def test_bilateral_chain_and_newby():
 
     for ratio, times in table.items():
         for j, t in enumerate(times):
-            assert opening(float(ratio), j, t - 0.1, t + 0.1) == pytest.approx(t, rel=1e-12)
+            assert opening(float(ratio), j, t - 0.1, t + 0.1) == pytest.approx(
+                t, rel=1e-12
+            )
     exact = (2.241337913521566978102, 6.171292729553324410933, 11.45961201072390584258)
     for n, value in zip((2, 3, 4), exact):
         assert ji.theory.newby_ratio(n) == pytest.approx(value, rel=1e-14)
@@ -76,7 +78,13 @@ def test_restitution_of_two_materials_in_series():
     assert float(jax.grad(rule)(0.0, 0.3, "energy", k1, np.inf)) == pytest.approx(1.0)
     rigid_first = jax.grad(lambda k2: rule(e1, e2, "energy", np.inf, k2))
     assert float(rigid_first(k2)) == pytest.approx(0.0)
-    others = {"product": 0.36, "mean": 0.65, "geometric_mean": 0.6, "minimum": 0.4, "maximum": 0.9}
+    others = {
+        "product": 0.36,
+        "mean": 0.65,
+        "geometric_mean": 0.6,
+        "minimum": 0.4,
+        "maximum": 0.9,
+    }
     for name, value in others.items():
         assert float(rule(e1, e2, name)) == pytest.approx(value)
     np.testing.assert_allclose(rule([0.9, 0.1], [0.4, 0.4], "minimum"), [0.4, 0.1])
@@ -118,7 +126,9 @@ def test_gap_scale():
     assert "touching" in text[1]
     assert "gap 3 is 0.7 delta_c" in text[2]
     assert "one after another" in text[3]
-    assert "nothing approaches" in str(ji.theory.gap_scale(many, hertz, [-1.0, 0, 0, 0, 0]))
+    assert "nothing approaches" in str(
+        ji.theory.gap_scale(many, hertz, [-1.0, 0, 0, 0, 0])
+    )
 
 
 @pytest.mark.slow
@@ -141,10 +151,16 @@ def test_symmetric_discontinuity_is_a_smooth_crossover():
 @pytest.mark.slow
 def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
     """The lighter pair indents less: `delta_c^2.5 = m v^2 / k`, m = 2 m1 m2 / (m1 + m2)."""
-    masses, v, offset = [0.25, 1.0, 4.0], jnp.array([1.0, 0.0, -1.0]), jnp.linspace(-4, 4, 41)
+    masses, v, offset = (
+        [0.25, 1.0, 4.0],
+        jnp.array([1.0, 0.0, -1.0]),
+        jnp.linspace(-4, 4, 41),
+    )
     scene, law = ji.chain(jnp.array(masses)), ji.Compliant(ji.Hertz(1.0))
     outcome = ji.theory.crossover(scene, law, v, offset)
     larger = (2 * 1.0 * 4.0 / 5.0) ** 0.4
     gaps = larger * (2.0 + 0.5 * offset[:, None] * jnp.array([[1.0, -1.0]]))
-    direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(gaps)
+    direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(
+        gaps
+    )
     np.testing.assert_allclose(outcome.velocity, direct.velocity, rtol=0, atol=1e-9)

@@ -24,7 +24,10 @@ def test_separation_times():
     }
     for ratio, times in expected.items():
         np.testing.assert_allclose(separation_times(ratio), times, rtol=1e-13)
-    assert separation_times(0.0) == (pytest.approx(np.pi / np.sqrt(2), rel=1e-15), np.inf)
+    assert separation_times(0.0) == (
+        pytest.approx(np.pi / np.sqrt(2), rel=1e-15),
+        np.inf,
+    )
     np.testing.assert_allclose(separation_times(1e-8)[0], np.pi / np.sqrt(2), rtol=1e-8)
     np.testing.assert_allclose(separation_times(1e8), np.pi * np.sqrt(2 / 3), rtol=1e-4)
     both = separation_times(ji.theory.newby_ratio(2))
@@ -35,7 +38,8 @@ def test_separation_times():
 
 
 @pytest.mark.parametrize(
-    ("aspect", "sliding"), [(0.8, True), (2.0, True), (3.0, True), (0.5, False), (1.0, False)]
+    ("aspect", "sliding"),
+    [(0.8, True), (2.0, True), (3.0, True), (0.5, False), (1.0, False)],
 )
 def test_the_domain_of_a_block_is_that_of_the_audit(aspect, sliding):
     """On a grid. Corners that stick: a turning block carries the mass m (h / 2)^2 besides."""
@@ -69,7 +73,9 @@ def test_classes_of_rocking():
 
 
 def test_picture_of_the_domains():
-    domains = [rocking_domain(a, sliding) for a in (1.0, 2.0) for sliding in (True, False)]
+    domains = [
+        rocking_domain(a, sliding) for a in (1.0, 2.0) for sliding in (True, False)
+    ]
     figure = ji.plot.rocking_domains(domains)
     filled = [axes.patches[0].get_xy()[:-1] for axes in figure.axes]
     for domain, corners in zip(domains, filled):
@@ -127,7 +133,11 @@ def test_poisson_never_gains_energy():
     zero = np.zeros(2)
     for _ in range(300):
         a = rng.normal(size=(2, 2))
-        w, gamma, e = a @ a.T + 0.1 * np.eye(2), rng.normal(size=2), rng.uniform(0, 1, 2)
+        w, gamma, e = (
+            a @ a.T + 0.1 * np.eye(2),
+            rng.normal(size=2),
+            rng.uniform(0, 1, 2),
+        )
         p_c = moreau(w, gamma, zero)
         at_rest = gamma + w @ p_c
         p = (1 + e) * p_c + moreau(w, at_rest + w @ (e * p_c), zero)
@@ -139,11 +149,19 @@ def test_reentrant_corner():
     """One contact acts, the nearest; both where they are equally near; none if one is satisfied."""
     corner = ji.Scene([2.0, 2.0], [[1.0, 0.0], [0.0, 3.0]])
     first, second = reentrant_corner(corner, [-1.0, -0.2], [0.5, 1.0])
-    assert (first.contact, first.nearest, second.contact, second.nearest) == (1, True, 0, False)
+    assert (first.contact, first.nearest, second.contact, second.nearest) == (
+        1,
+        True,
+        0,
+        False,
+    )
     np.testing.assert_allclose(first.velocity, [-1.0, 0.2], atol=1e-15)  # gamma / 3
     np.testing.assert_allclose(second.velocity, [0.5, -0.2], atol=1e-15)
     assert second.impulse == pytest.approx(3.0)
-    assert [x.nearest for x in reentrant_corner(corner, [-1.0, -1.0], 0.5)] == [True, True]
+    assert [x.nearest for x in reentrant_corner(corner, [-1.0, -1.0], 0.5)] == [
+        True,
+        True,
+    ]
     assert reentrant_corner(corner, [-1.0, 0.0], 0.5) == []
     with pytest.raises(ValueError, match="`velocity`"):
         reentrant_corner(corner, [-1.0], 0.5)

@@ -14,15 +14,21 @@ import jimpact as ji
 close = np.testing.assert_allclose
 # (e, mu, e_t, k) -> law; e_t is of the kinematic laws, k of LZB
 LAWS = {
-    "newton": lambda e, mu, e_t, k: ji.Newton(e, friction=mu, tangential_restitution=e_t),
-    "moreau": lambda e, mu, e_t, k: ji.Moreau(e, friction=mu, tangential_restitution=e_t),
+    "newton": lambda e, mu, e_t, k: ji.Newton(
+        e, friction=mu, tangential_restitution=e_t
+    ),
+    "moreau": lambda e, mu, e_t, k: ji.Moreau(
+        e, friction=mu, tangential_restitution=e_t
+    ),
     "matrix": lambda e, mu, e_t, k: ji.RestitutionMatrix(
         jnp.diag(e), friction=mu, tangential_restitution=e_t
     ),
     "binary": lambda e, mu, e_t, k: ji.Binary(
         e, "earliest", friction=mu, tangential_restitution=e_t
     ),
-    "poisson": lambda e, mu, e_t, k: ji.Poisson(e, friction=mu, tangential_restitution=e_t),
+    "poisson": lambda e, mu, e_t, k: ji.Poisson(
+        e, friction=mu, tangential_restitution=e_t
+    ),
     "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu, method="time"),
     "compliant": lambda e, mu, e_t, k: ji.Compliant(
         ji.Bistiffness(k, 1.5, e), friction=mu, method="time"
@@ -57,10 +63,14 @@ def run(name, mass, normals, tangents, v, e, mu, e_t=0.0, k=1.0):
     full = np.tile(np.eye(n + idle), (count, 1, 1))
     full[:, :n, :n] = mass
     mass = full
-    normals, tangents = (np.pad(x, ((0, 0), (0, idle), (0, 0))) for x in (normals, tangents))
+    normals, tangents = (
+        np.pad(x, ((0, 0), (0, idle), (0, 0))) for x in (normals, tangents)
+    )
     v = np.pad(v, ((0, 0), (0, idle)))
     if m == 1:
-        normals, tangents = (np.concatenate([x, x[:, :, :rows]], 2) for x in (normals, tangents))
+        normals, tangents = (
+            np.concatenate([x, x[:, :, :rows]], 2) for x in (normals, tangents)
+        )
     # far from closing while the other one is indented: `compliant` would feel it
     gaps = np.tile([0.0, 1e3 * (m == 1)], (count, 1))
     per = [
@@ -92,7 +102,9 @@ def test_given_slip_agrees_with_the_law():
     e, mu, fast = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2, np.array([2.0, -0.6, -0.3])
     out = ji.impact(ji.RestitutionMatrix(e, friction=mu), FLAT, fast)
     p, side = ji.theory.friction_impulses(FLAT, e, mu, 1.0, fast)
-    assert float((FLAT.tangents.T @ out.velocity)[0]) > 0  # still sliding: xi = 1 was right
+    assert (
+        float((FLAT.tangents.T @ out.velocity)[0]) > 0
+    )  # still sliding: xi = 1 was right
     close(out.impulse, p, rtol=1e-12)
     close(out.tangential_impulse, side, rtol=1e-12)
 

@@ -38,7 +38,9 @@ def exact_tree(masses, v, e=1):
 
     w = [
         [
-            (1 / m[i] + 1 / m[i + 1]) if i == j else (-1 / m[max(i, j)] if abs(i - j) == 1 else 0)
+            (1 / m[i] + 1 / m[i + 1])
+            if i == j
+            else (-1 / m[max(i, j)] if abs(i - j) == 1 else 0)
             for j in range(n - 1)
         ]
         for i in range(n - 1)
@@ -90,7 +92,9 @@ def test_the_tree_is_exhaustive(masses, v, count):
     found = han_gilmore(ji.chain(np.array(masses, float)), np.array(v, float))
     assert count is None or len(found) == count
     assert len(found) == len(as_set(found)) == len(exact) > 1
-    assert as_set(found) == {tuple(np.round([float(x) for x in v], 8) + 0.0) for v in exact}
+    assert as_set(found) == {
+        tuple(np.round([float(x) for x in v], 8) + 0.0) for v in exact
+    }
 
 
 def test_three_balls_and_the_rules_that_led_there():
@@ -110,7 +114,9 @@ def check(scene, v, outcomes):
     """What every outcome must satisfy on the contacts that take part."""
     energy = float(ji.kinetic_energy(scene, v))
     for found in outcomes:
-        assert float(ji.kinetic_energy(scene, found.velocity)) == pytest.approx(energy, rel=1e-12)
+        assert float(ji.kinetic_energy(scene, found.velocity)) == pytest.approx(
+            energy, rel=1e-12
+        )
         gamma = np.asarray(ji.gap_velocity(scene, found.velocity))
         assert (gamma[np.asarray(scene.closed)] >= -1e-9).all()
         assert (found.impulse >= 0).all()
@@ -137,10 +143,14 @@ def test_wall_and_constraint_and_general_mass():
     assert len(outcomes) == 2
     np.testing.assert_allclose(outcomes[0].velocity, [-1, -1], atol=1e-14)
     np.testing.assert_allclose(outcomes[1].velocity, [-11 / 9, -1 / 9], atol=1e-14)
-    full = ji.Scene(np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[1.0, -0.4], [-0.3, 0.9]]))
+    full = ji.Scene(
+        np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[1.0, -0.4], [-0.3, 0.9]])
+    )
     check(full, [-1.0, 0.2], han_gilmore(full, [-1.0, 0.2]))
     # two bodies tied together act as one: a ball of mass 1 hits a pair of mass 2
-    tied = ji.Scene([1.0, 1.0, 1.0], [[-1.0], [1.0], [0.0]], constraints=[[0.0], [1.0], [-1.0]])
+    tied = ji.Scene(
+        [1.0, 1.0, 1.0], [[-1.0], [1.0], [0.0]], constraints=[[0.0], [1.0], [-1.0]]
+    )
     (found,) = han_gilmore(tied, [1.0, 0.0, 0.0])
     np.testing.assert_allclose(found.velocity, [-1 / 3, 2 / 3, 2 / 3], atol=1e-14)
 
@@ -215,10 +225,13 @@ def test_losses_in_exact_arithmetic(masses):
     e = Fraction(1, 2)
     exact = exact_tree(masses, (1, 0, 0), e)
     found = han_gilmore(ji.chain(np.array(masses, float)), [1.0, 0, 0], 0.5)
-    assert as_set(found) == {tuple(np.round([float(x) for x in v], 8) + 0.0) for v in exact}
+    assert as_set(found) == {
+        tuple(np.round([float(x) for x in v], 8) + 0.0) for v in exact
+    }
     assert not any(outcome.endless for outcome in found)
     energies = [
-        float(ji.kinetic_energy(ji.chain(np.array(masses, float)), o.velocity)) for o in found
+        float(ji.kinetic_energy(ji.chain(np.array(masses, float)), o.velocity))
+        for o in found
     ]
     assert max(energies) < 0.5 * masses[0]
 
@@ -242,7 +255,9 @@ def test_friction_of_one_contact():
     slip, ease = 1.2, 1 + 1 / inertia
     for mu, p_t in ((0.1, -0.1 * 1.5), (1.0, -slip / ease)):
         (found,) = han_gilmore(scene, v, 0.5, mu)
-        np.testing.assert_allclose(found.velocity, [1 + p_t, 0.5, 0.2 + p_t / inertia], atol=1e-12)
+        np.testing.assert_allclose(
+            found.velocity, [1 + p_t, 0.5, 0.2 + p_t / inertia], atol=1e-12
+        )
         np.testing.assert_allclose(found.tangential_impulse, [p_t], atol=1e-12)
         assert ("slides forward" in found.rules[0]) == (mu == 0.1)
         assert ("sticks" in found.rules[0]) == (mu == 1.0)
@@ -257,12 +272,16 @@ def test_friction_of_a_block_on_two_corners():
     assert found
     start = float(ji.kinetic_energy(block, v))
     for outcome in found:
-        assert (np.abs(outcome.tangential_impulse) <= [0.3, 0.5] * outcome.impulse + 1e-9).all()
+        assert (
+            np.abs(outcome.tangential_impulse) <= [0.3, 0.5] * outcome.impulse + 1e-9
+        ).all()
         assert (ji.gap_velocity(block, outcome.velocity) >= -1e-9).all()
         assert float(ji.kinetic_energy(block, outcome.velocity)) < start
         push = np.asarray(block.normals) @ outcome.impulse
         push += np.asarray(block.tangents) @ outcome.tangential_impulse
-        np.testing.assert_allclose(v + push / np.asarray(block.mass), outcome.velocity, atol=1e-12)
+        np.testing.assert_allclose(
+            v + push / np.asarray(block.mass), outcome.velocity, atol=1e-12
+        )
     assert np.abs(found[0].velocity - without[0].velocity).max() > 0.01
 
 
@@ -270,7 +289,9 @@ def test_bad_coefficients():
     balls = ji.chain(jnp.ones(3))
     with pytest.raises(ValueError, match=r"`restitution` must lie in \[0, 1\]"):
         han_gilmore(balls, [1.0, 0, 0], 1.2)
-    with pytest.raises(ValueError, match="`restitution` must be a scalar or have shape"):
+    with pytest.raises(
+        ValueError, match="`restitution` must be a scalar or have shape"
+    ):
         han_gilmore(balls, [1.0, 0, 0], [0.5] * 3)
     with pytest.raises(ValueError, match="`scene` must have one tangent a contact"):
         han_gilmore(balls, [1.0, 0, 0], 0.5, 0.1)

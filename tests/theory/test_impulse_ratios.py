@@ -13,7 +13,9 @@ def test_the_interval_ends_where_a_contact_stays_closed():
         masses, e = rng.uniform(0.3, 3, 3), rng.uniform(0.2, 1)
         w = np.array([[1 / masses[0] + 1 / masses[1], -1 / masses[1]],
                       [-1 / masses[1], 1 / masses[1] + 1 / masses[2]]])  # fmt: skip
-        low, high = (x[0, 1] for x in ji.theory.correlation_interval(ji.chain(masses), e))
+        low, high = (
+            x[0, 1] for x in ji.theory.correlation_interval(ji.chain(masses), e)
+        )
         assert np.isnan(ji.theory.correlation_interval(ji.chain(masses), e)[0][0, 0])
         for r, closed in ((low, 1), (high, 0)):
             d = np.array([1.0, r])

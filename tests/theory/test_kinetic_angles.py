@@ -28,7 +28,11 @@ def test_constraints_reduce_and_distort():
     """(6.35): the Schur complement of G over the constraints; welded balls are one."""
     rng = np.random.default_rng(4)
     x = rng.normal(size=(5, 5))
-    mass, normals, h = x @ x.T + np.eye(5), rng.normal(size=(5, 2)), rng.normal(size=(5, 2))
+    mass, normals, h = (
+        x @ x.T + np.eye(5),
+        rng.normal(size=(5, 2)),
+        rng.normal(size=(5, 2)),
+    )
     every = np.hstack([h, normals])
     free = every.T @ np.linalg.solve(mass, every)
     free = free / np.sqrt(np.outer(np.diag(free), np.diag(free)))
@@ -66,7 +70,11 @@ BLOCKS = {  # aspect: kinetic angle, 40-digit values
     2.0: 1.82347658193697527,
     3.0: 2.13940662705907887,
 }
-DIMERS = {0.0: 1.44546849562683122, 5 / 24: 1.42420445174657522, 1e12: 1.53630673083321779}
+DIMERS = {
+    0.0: 1.44546849562683122,
+    5 / 24: 1.42420445174657522,
+    1e12: 1.53630673083321779,
+}
 
 
 @pytest.mark.slow
@@ -74,13 +82,17 @@ def test_kinetic_angles_of_bodies():
     @jax.jit
     def angles(aspects, ratios):
         block = jax.vmap(
-            lambda a: ji.theory.kinetic_angles(ji.Block(2.0, 2 * a, 3.0, corners="base").scene())[
-                0, 1
-            ]
+            lambda a: ji.theory.kinetic_angles(
+                ji.Block(2.0, 2 * a, 3.0, corners="base").scene()
+            )[0, 1]
         )
-        dimer = jax.vmap(lambda r: ji.theory.kinetic_angles(ji.Dimer(2 * r, 2.0).scene())[0, 1])
+        dimer = jax.vmap(
+            lambda r: ji.theory.kinetic_angles(ji.Dimer(2 * r, 2.0).scene())[0, 1]
+        )
         together = ji.theory.kinetic_angles(ji.Dimer(2.0, 0.0).scene())[0, 1]
-        cosine = jax.grad(lambda r: ji.theory.normalized_delassus(ji.Dimer(r, 1.0).scene())[0, 1])
+        cosine = jax.grad(
+            lambda r: ji.theory.normalized_delassus(ji.Dimer(r, 1.0).scene())[0, 1]
+        )
         return (
             block(aspects),
             dimer(ratios),
@@ -95,11 +107,17 @@ def test_kinetic_angles_of_bodies():
     # least angle at R / L = 5/24: the slope vanishes and rises
     assert abs(float(slope[1])) < 1e-12
     assert float(slope[0]) < -1e-3 < 1e-3 < float(slope[2])
-    corner = jax.jit(jax.vmap(lambda a: ji.theory.kinetic_angles(ji.Corner(a, 2.0).scene())[0, 1]))
-    np.testing.assert_allclose(corner(np.array([0.1, 1.2, 3.0])), [0.1, 1.2, 3.0], atol=1e-14)
+    corner = jax.jit(
+        jax.vmap(lambda a: ji.theory.kinetic_angles(ji.Corner(a, 2.0).scene())[0, 1])
+    )
+    np.testing.assert_allclose(
+        corner(np.array([0.1, 1.2, 3.0])), [0.1, 1.2, 3.0], atol=1e-14
+    )
     phi, masses, m0 = np.array([0.3, 1.9, -2.0]), np.array([0.5, 0.7, 2.0]), 1.5
     disc = built(around_a_disc, phi, masses, m0, 0.3, [0.1, 0.2, 0.1])
-    g = np.cos(phi[:, None] - phi) / np.sqrt((1 + m0 / masses)[:, None] * (1 + m0 / masses))
+    g = np.cos(phi[:, None] - phi) / np.sqrt(
+        (1 + m0 / masses)[:, None] * (1 + m0 / masses)
+    )
     away = ~np.eye(3, dtype=bool)
     found = dense(jax.jit(ji.theory.normalized_delassus)(disc))
     np.testing.assert_allclose(found[away], g[away], atol=1e-14)

@@ -27,7 +27,9 @@ def test_superballs_return_their_slip():
     close(value, -0.4, rtol=1e-8)
     for kappa, e in ((0.1, 0.8), (0.3, 0.5), (0.6, 1.0)):  # with hardly a limit
         value, slopes = run(kappa, 1e7, e)
-        closed = jax.value_and_grad(lambda k, e: ji.theory.spring_slip(0.4, e, k), argnums=(0, 1))
+        closed = jax.value_and_grad(
+            lambda k, e: ji.theory.spring_slip(0.4, e, k), argnums=(0, 1)
+        )
         expected, expected_slopes = closed(kappa, e)
         close(value, expected, atol=1e-6)
         close(slopes, expected_slopes, atol=1e-5)

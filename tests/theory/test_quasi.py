@@ -80,7 +80,9 @@ def test_flat_block():
     # G_12 = (a^2 - 2) / (a^2 + 4), a = height / width
     a = 1 / 1.5
     metric = np.asarray(block().mass)[:, None]
-    np.testing.assert_allclose((normal.T @ (metric * normal))[0, 1], (a**2 - 2) / (a**2 + 4))
+    np.testing.assert_allclose(
+        (normal.T @ (metric * normal))[0, 1], (a**2 - 2) / (a**2 + 4)
+    )
 
 
 @pytest.mark.slow
@@ -96,7 +98,9 @@ def test_friction_block():
     e = np.array([[0.5, 0.1], [0.2, 0.3]])
     np.testing.assert_allclose(qn_after, -e @ qn, atol=1e-14)
     np.testing.assert_allclose(qt_after, [0.545649424529250514], atol=1e-14)
-    np.testing.assert_allclose((scene.tangents.T @ v)[0], 0.205560366122430203, atol=1e-14)
+    np.testing.assert_allclose(
+        (scene.tangents.T @ v)[0], 0.205560366122430203, atol=1e-14
+    )
     # the work of the impulses is their power at the mean velocity
     work = power(scene, 0.5 * (v + after), p, side)
     np.testing.assert_allclose(work.total, -0.567592042214138333, atol=1e-14)
@@ -114,12 +118,18 @@ def test_identities_of_random_scenes(constraints):
     normal, tangent = map(np.asarray, basis(scene))
     mass = np.asarray(scene.mass)
     assert tangent.shape == (6, 4 - constraints)
-    np.testing.assert_allclose(tangent.T @ mass @ tangent, np.eye(4 - constraints), atol=1e-12)
+    np.testing.assert_allclose(
+        tangent.T @ mass @ tangent, np.eye(4 - constraints), atol=1e-12
+    )
     np.testing.assert_allclose(tangent.T @ mass @ normal, 0, atol=1e-12)
     if constraints:
-        np.testing.assert_allclose(tangent.T @ np.asarray(scene.constraints), 0, atol=1e-12)
+        np.testing.assert_allclose(
+            tangent.T @ np.asarray(scene.constraints), 0, atol=1e-12
+        )
     qn, qt = to_quasi(scene, v)
-    np.testing.assert_allclose(qn, ji.theory.normalized_gap_velocity(scene, v), atol=1e-13)
+    np.testing.assert_allclose(
+        qn, ji.theory.normalized_gap_velocity(scene, v), atol=1e-13
+    )
     np.testing.assert_allclose(qn, normal.T @ mass @ v, atol=1e-12)
     np.testing.assert_allclose(from_quasi(scene, qn, qt), v, atol=1e-12)
     parts = split(scene, v)
@@ -142,7 +152,9 @@ def test_power_of_contact_forces(constraints):
     np.testing.assert_allclose(found.total, found.normal + local, atol=1e-12)
     # (6.39): no coupling where the contacts are at rest
     at_rest = from_quasi(scene, jnp.zeros(2), to_quasi(scene, v)[1])
-    np.testing.assert_allclose(power(scene, at_rest, force, side).coupling, 0, atol=1e-12)
+    np.testing.assert_allclose(
+        power(scene, at_rest, force, side).coupling, 0, atol=1e-12
+    )
     assert abs(float(found.coupling)) > 1e-3
     frictionless = power(scene, v, force)
     np.testing.assert_allclose(frictionless.total, found.normal, atol=1e-15)
@@ -165,7 +177,13 @@ def test_basis_is_smooth_in_the_scene():
     turn = jnp.asarray(np.random.default_rng(5).normal(size=(6, 2)))
 
     def moved(s):
-        at = ji.Scene(scene.mass * (1 + s), scene.normals + s * turn, None, None, scene.constraints)
+        at = ji.Scene(
+            scene.mass * (1 + s),
+            scene.normals + s * turn,
+            None,
+            None,
+            scene.constraints,
+        )
         return from_quasi_velocities(at, qn, qt)
 
     forward = jax.jit(jax.jacfwd(moved))(0.0)
@@ -190,8 +208,14 @@ def test_redundant_contacts_are_refused():
         quasi_basis(ji.Scene([1.0, 1.0], [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]))
     with pytest.raises(ValueError, match="redundant ones"):
         quasi_basis(ji.Scene([1.0, 1.0], [[1.0, 1.0], [0.0, 0.0]]))
-    with pytest.raises(ValueError, match="redundant ones"):  # a contact that a constraint holds
-        quasi_basis(ji.Scene(jnp.ones(3), [[1.0], [0.0], [0.0]], constraints=[[2.0], [0.0], [0.0]]))
+    with pytest.raises(
+        ValueError, match="redundant ones"
+    ):  # a contact that a constraint holds
+        quasi_basis(
+            ji.Scene(
+                jnp.ones(3), [[1.0], [0.0], [0.0]], constraints=[[2.0], [0.0], [0.0]]
+            )
+        )
 
 
 def test_bad_input():

@@ -55,7 +55,9 @@ def test_check_values():
     np.testing.assert_allclose(qn, [0.73, 0.43], atol=1e-14)
     np.testing.assert_allclose(qt, [0.4], atol=1e-14)
     pbar = out.impulse * kinetic_norm(CHAIN)
-    np.testing.assert_allclose(pbar, [2.57058240589371162, 1.87959940026865904], atol=1e-14)
+    np.testing.assert_allclose(
+        pbar, [2.57058240589371162, 1.87959940026865904], atol=1e-14
+    )
     np.testing.assert_allclose(out.energy_change, -0.224854663778188231, atol=1e-14)
     assert int(out.status) == 0
     contact = ji.Contact(ji.delassus_matrix(CHAIN), ji.gap_velocity(CHAIN, v))
@@ -70,29 +72,41 @@ def test_self_adjoint_matrix():
     g = -np.cos(g)
     e = g @ np.array([[0.5, 0.1], [0.1, 0.3]])
     np.testing.assert_allclose(
-        np.sort(np.linalg.eigvals(e)), [0.236018788194505563, 0.474538492705502849], atol=1e-14
+        np.sort(np.linalg.eigvals(e)),
+        [0.236018788194505563, 0.474538492705502849],
+        atol=1e-14,
     )
-    out = ji.impact(RestitutionMatrix(e), CHAIN, velocity_of(CHAIN, [-1.0, -0.3], [0.0]))
+    out = ji.impact(
+        RestitutionMatrix(e), CHAIN, velocity_of(CHAIN, [-1.0, -0.3], [0.0])
+    )
     np.testing.assert_allclose(out.energy_change, -0.735489507379329992, atol=1e-14)
 
 
 def test_slender_block_pulls():
     """E = e I is not kinetically consistent beyond a kinetic angle of pi/2."""
     scene = block(height=2.0, width=1.0)
-    out = ji.impact(RestitutionMatrix(0.5 * jnp.eye(2)), scene, velocity_of(scene, [0, -1.0], [0]))
-    np.testing.assert_allclose(out.impulse * kinetic_norm(scene), [-0.4, 1.6], atol=1e-14)
+    out = ji.impact(
+        RestitutionMatrix(0.5 * jnp.eye(2)), scene, velocity_of(scene, [0, -1.0], [0])
+    )
+    np.testing.assert_allclose(
+        out.impulse * kinetic_norm(scene), [-0.4, 1.6], atol=1e-14
+    )
     assert int(out.status) == CODE["negative_impulse"]
 
 
 def test_diagonal_matrix_is_newton():
     v = jnp.array([1.0, 0.0, -0.5])
-    a = ji.impact(RestitutionMatrix(jnp.diag(jnp.array([0.8, 0.4]))), ji.chain(jnp.ones(3)), v)
+    a = ji.impact(
+        RestitutionMatrix(jnp.diag(jnp.array([0.8, 0.4]))), ji.chain(jnp.ones(3)), v
+    )
     np.testing.assert_allclose(a.velocity, [-13 / 30, 11 / 30, 17 / 30], atol=1e-14)
     np.testing.assert_allclose(a.impulse, [43 / 30, 16 / 15], atol=1e-14)
 
 
 def test_energy_gain_is_flagged():
-    out = ji.impact(RestitutionMatrix([[0.1, 0], [1.8, 0.5]]), ji.chain(jnp.ones(3)), [1.0, 0, 0])
+    out = ji.impact(
+        RestitutionMatrix([[0.1, 0], [1.8, 0.5]]), ji.chain(jnp.ones(3)), [1.0, 0, 0]
+    )
     assert int(out.status) == CODE["energy_gain"]
     assert float(out.energy_change) > 0
 
@@ -106,7 +120,9 @@ def full_matrix(scene, scale=0.4, seed=0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", [block(theta=0.1), CONSTRAINED], ids=["block", "constrained"])
+@pytest.mark.parametrize(
+    "scene", [block(theta=0.1), CONSTRAINED], ids=["block", "constrained"]
+)
 def test_tangential_blocks(scene):
     """v+ = -E v- in all quasi-velocities; impulses, energy and constraints agree with it."""
     e = full_matrix(scene)
@@ -160,7 +176,9 @@ def test_unreachable_tangential_change_is_infeasible():
 def test_open_contacts_take_no_part():
     e = jnp.array([[0.6, 0.3, 0.1], [0.2, 0.5, 0.4], [0.3, 0.2, 0.7]])
     masses, v = jnp.array([1.0, 2.0, 1.5, 1.0]), jnp.array([1.0, 0.2, -0.5, -1.5])
-    gapped = ji.impact(RestitutionMatrix(e), ji.chain(masses, gaps=jnp.array([0, 0, 1e-3])), v)
+    gapped = ji.impact(
+        RestitutionMatrix(e), ji.chain(masses, gaps=jnp.array([0, 0, 1e-3])), v
+    )
     alone = ji.impact(RestitutionMatrix(e[:2, :2]), ji.chain(masses[:3]), v[:3])
     np.testing.assert_allclose(gapped.velocity[:3], alone.velocity, atol=1e-14)
     assert float(gapped.velocity[3]) == -1.5
@@ -203,11 +221,17 @@ def test_rocking(aspect):
     v = jnp.array([-aspect / 2, 0.5, 1.0]) * rate
     np.testing.assert_allclose(ji.gap_velocity(scene, v), [rate, 0], atol=1e-15)
     out = ji.impact(RestitutionMatrix(rocking_matrix(e)), scene, v)
-    np.testing.assert_allclose(ji.gap_velocity(scene, out.velocity), [0, -e * rate], atol=1e-14)
+    np.testing.assert_allclose(
+        ji.gap_velocity(scene, out.velocity), [0, -e * rate], atol=1e-14
+    )
     np.testing.assert_allclose(out.velocity[0], e * v[0], atol=1e-14)
     np.testing.assert_allclose(out.velocity[2], e * rate, atol=1e-14)
-    np.testing.assert_allclose(scene.tangents[:, 0] @ out.velocity, 0, atol=1e-14)  # no slip at B
-    np.testing.assert_allclose(out.energy_change, (e**2 - 1) * kinetic(scene, v), atol=1e-14)
+    np.testing.assert_allclose(
+        scene.tangents[:, 0] @ out.velocity, 0, atol=1e-14
+    )  # no slip at B
+    np.testing.assert_allclose(
+        out.energy_change, (e**2 - 1) * kinetic(scene, v), atol=1e-14
+    )
     # Housner: angular momentum about B is conserved, so A's impulse vanishes
     np.testing.assert_allclose(out.impulse[1], 0, atol=1e-14)
     assert float(out.impulse[0]) > 0
@@ -240,8 +264,13 @@ def test_rocking_ratios_are_a_conversion():
 def test_derivatives_in_the_entries(scene):
     """v+ is affine in E: dv+/dE_ij = -M^-1 N diag(1/|grad f|) G^-1 e_i qn_j."""
     n, m = scene.size, scene.contacts
-    v = velocity_of(scene, [-1.0, -0.3], jnp.ones(to_quasi(scene, jnp.zeros(n))[1].size))
-    norm, qn = kinetic_norm(scene), np.asarray(ji.theory.normalized_gap_velocity(scene, v))
+    v = velocity_of(
+        scene, [-1.0, -0.3], jnp.ones(to_quasi(scene, jnp.zeros(n))[1].size)
+    )
+    norm, qn = (
+        kinetic_norm(scene),
+        np.asarray(ji.theory.normalized_gap_velocity(scene, v)),
+    )
     g = normalized_delassus(scene)
     g = np.asarray(g if isinstance(g, jax.Array) else g.as_matrix())
     push = np.stack(
@@ -261,7 +290,11 @@ def test_derivatives_of_the_full_matrix():
     """v+ = -(n_q G^-1, t_q) E (qn, qt): linear in E."""
     scene = block(theta=0.1)
     qn, qt = jnp.array([-1.0, -0.2]), jnp.array([0.5])
-    v, quasi, e = velocity_of(scene, qn, qt), jnp.concatenate([qn, qt]), full_matrix(scene)
+    v, quasi, e = (
+        velocity_of(scene, qn, qt),
+        jnp.concatenate([qn, qt]),
+        full_matrix(scene),
+    )
     columns = np.stack(
         [velocity_of(scene, x[:2], x[2:]) for x in np.eye(3)],
         axis=1,
@@ -285,7 +318,10 @@ def test_batch_and_float32():
     scene, law = block(), RestitutionMatrix(rocking_matrix(jnp.float32(0.5)))
     single = jax.tree.map(lambda x: x.astype(jnp.float32), scene)
     out = ji.impact(law, single, jnp.array([0.1, -1.0, 0.3], jnp.float32))
-    assert {x.dtype for x in jax.tree.leaves(out)} == {jnp.dtype("float32"), jnp.dtype("int32")}
+    assert {x.dtype for x in jax.tree.leaves(out)} == {
+        jnp.dtype("float32"),
+        jnp.dtype("int32"),
+    }
 
 
 # ----------------------------------------------------------------------------- bad input

@@ -32,17 +32,23 @@ def test_without_friction_as_the_check_values(found, a, eta, e, expected):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("exponent", "stiffness"), [(1.0, None), (1.5, None), (1.5, (1.0, 4.0))])
+@pytest.mark.parametrize(
+    ("exponent", "stiffness"), [(1.0, None), (1.5, None), (1.5, (1.0, 4.0))]
+)
 def test_the_tip_depends_on_friction_alone(found, exponent, stiffness):
     out = solved(BOTH, E, exponent, stiffness) if stiffness else found[exponent]
     size = np.abs(out.dispersion)
     assert (np.asarray(out.dispersion) <= 1e-9).all()
     for j in range(3):
-        np.testing.assert_allclose(size[4 + j, j], 0.0, atol=1e-8)  # at the tip, whatever e is
+        np.testing.assert_allclose(
+            size[4 + j, j], 0.0, atol=1e-8
+        )  # at the tip, whatever e is
         others = np.delete(size[:, j], 4 + j, axis=0)
         assert others.min() > 0.005
     np.testing.assert_allclose(
-        ji.theory.critical_kinetic_angle(MU), ji.theory.rocking_kinetic_angle(CRITICAL), rtol=1e-14
+        ji.theory.critical_kinetic_angle(MU),
+        ji.theory.rocking_kinetic_angle(CRITICAL),
+        rtol=1e-14,
     )
 
 
@@ -53,16 +59,27 @@ def test_critical_angles_in_degrees():
 
 
 def test_record_and_words():
-    gamma = np.array([[0.0, 0.0], [0.0, 0.4], [0.5, 0.04], [0.5, 0.4], [np.nan, np.nan]])
+    gamma = np.array(
+        [[0.0, 0.0], [0.0, 0.4], [0.5, 0.04], [0.5, 0.4], [np.nan, np.nan]]
+    )
     a, one = np.array([0.4, 1.0, 2.0, 3.0, 4.0]), np.ones((5, 1, 1))
     record = RockingDispersion(
         a, np.array([0.3]), np.array([0.5]), gamma[:, None, None], one, one, one, one
     )
     assert record.outcomes().ravel().tolist() == [0, 1, 2, 3, 4]
-    assert record.outcomes(separation_threshold=0.03).ravel().tolist() == [0, 1, 3, 3, 4]
+    assert record.outcomes(separation_threshold=0.03).ravel().tolist() == [
+        0,
+        1,
+        3,
+        3,
+        4,
+    ]
     np.testing.assert_allclose(record.dispersion[:4, 0, 0], [0, -0.4, -0.04, -0.4])
     np.testing.assert_allclose(record.over_housner[:, 0, 0], 1 / housner_restitution(a))
-    assert "critical angle 79.42 degrees; 1 rest, 1 rocking, 1 half-rocking, 1 free" in str(record)
+    assert (
+        "critical angle 79.42 degrees; 1 rest, 1 rocking, 1 half-rocking, 1 free"
+        in str(record)
+    )
     v = ji.plot.rocking_dispersion(record)
     np.testing.assert_allclose(v.axes[0].lines[0].get_ydata(), np.abs(gamma[:, 1]))
     np.testing.assert_allclose(v.axes[0].lines[1].get_xdata(), 79.42, atol=0.01)
@@ -103,7 +120,9 @@ def test_the_tip_is_found_by_impacts_alone():
     mu, e = [0.0, 0.3, 1.0], [0.3, 0.8, 1.0]
     angle = ji.theory.search_critical_angle(mu, e)
     np.testing.assert_allclose(np.ptp(angle, axis=1), 0.0, atol=1e-7)  # in e
-    np.testing.assert_allclose(angle[:, 0], ji.theory.critical_kinetic_angle(mu), atol=1e-7)
+    np.testing.assert_allclose(
+        angle[:, 0], ji.theory.critical_kinetic_angle(mu), atol=1e-7
+    )
 
 
 @pytest.mark.slow

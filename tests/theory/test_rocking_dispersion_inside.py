@@ -29,7 +29,9 @@ def test_right_of_the_tip_by_closed_forms():
     e = np.array([0.0, 0.3, 0.8, 1.0])
     out = solved(RIGHT, e, 1.5)
     assert (np.asarray(out.status) == 0).all()
-    expected = right_of_the_tip(RIGHT[:, None, None], MU[None, :, None], e[None, None, :])
+    expected = right_of_the_tip(
+        RIGHT[:, None, None], MU[None, :, None], e[None, None, :]
+    )
     np.testing.assert_allclose(out.gap_velocity, expected, atol=2e-9)
     # sticking and plastic is Housner's block; without friction it loses more
     np.testing.assert_allclose(out.over_housner[:, 2, 0], 1.0, atol=1e-8)
@@ -40,7 +42,10 @@ def test_right_of_the_tip_by_closed_forms():
     np.testing.assert_allclose(kept[:, [0, 2]], 1.0, atol=1e-8)
     assert (kept[:2, 1] < 0.999).all()
     assert np.array(OUTCOMES)[out.outcomes()[:, :, 0]].tolist() == [["rocking"] * 3] * 7
-    assert np.array(OUTCOMES)[out.outcomes()[:, :, 1:]].tolist() == [[["free"] * 3] * 3] * 7
+    assert (
+        np.array(OUTCOMES)[out.outcomes()[:, :, 1:]].tolist()
+        == [[["free"] * 3] * 3] * 7
+    )
 
 
 def test_it_is_half_rocking_at_the_tip_and_free_beside_it(found):

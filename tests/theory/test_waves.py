@@ -52,7 +52,12 @@ def test_bad_input(call, message):
 
 def verlet(balls, step, stop):
     """gamma' = W x^1.5, x' = -gamma, x >= 0 of unit balls and springs, the first at 1 m/s: v, F."""
-    v, x, force, most = np.eye(balls)[0], np.zeros(balls - 1), np.zeros(balls - 1), np.zeros(balls)
+    v, x, force, most = (
+        np.eye(balls)[0],
+        np.zeros(balls - 1),
+        np.zeros(balls - 1),
+        np.zeros(balls),
+    )
     for _ in range(int(stop / step)):
         v[:-1] -= step / 2 * force
         v[1:] += step / 2 * force
@@ -76,7 +81,9 @@ def test_a_solitary_wave():
     time, force = np.asarray(h.time), np.asarray(h.force)
     arrival = time[force.argmax(axis=0)]
     np.testing.assert_allclose(20 / (arrival[45] - arrival[25]), speed, rtol=0.01)
-    np.testing.assert_allclose(force[:, 26:46].max(axis=0) / force[:, 25].max(), 1.0, atol=2e-3)
+    np.testing.assert_allclose(
+        force[:, 26:46].max(axis=0) / force[:, 25].max(), 1.0, atol=2e-3
+    )
     kinetic = np.asarray(h.velocity[np.asarray(h.velocity)[:, 30].argmax()]) ** 2
     assert kinetic[28:33].sum() > 0.9999 * kinetic[20:].sum()
 

@@ -42,7 +42,9 @@ def programs(folder) -> list[Path]:
 def is_loaded(monkeypatch, path) -> bool:
     """True if the next impact comes from a file, not from the compiler."""
     written = []
-    monkeypatch.setattr(kept_programs, "_write", lambda *arguments: written.append(arguments))
+    monkeypatch.setattr(
+        kept_programs, "_write", lambda *arguments: written.append(arguments)
+    )
     np.testing.assert_allclose(impact(), EXPECTED, rtol=1e-14)
     monkeypatch.undo()
     return not written
@@ -54,8 +56,12 @@ def test_a_program_is_loaded_and_gives_the_same_bits(folder, monkeypatch):
     assert len(programs(folder)) == 1
     assert is_loaded(monkeypatch, folder)
     np.testing.assert_array_equal(impact(), first)
-    other = ji.impact(ji.Newton(0.3), PAIR, [2.0, 0.5]).velocity  # other numbers, the same program
-    np.testing.assert_allclose(other, np.array([0.875, 0.875]) + 0.45 * np.array([-0.75, 0.25]))
+    other = ji.impact(
+        ji.Newton(0.3), PAIR, [2.0, 0.5]
+    ).velocity  # other numbers, the same program
+    np.testing.assert_allclose(
+        other, np.array([0.875, 0.875]) + 0.45 * np.array([-0.75, 0.25])
+    )
     assert len(programs(folder)) == 1
 
 
@@ -85,7 +91,8 @@ def writable_by_others(path):
 
 
 @pytest.mark.parametrize(
-    "damage", [bit_flipped, half_written, emptied, of_another_program, writable_by_others]
+    "damage",
+    [bit_flipped, half_written, emptied, of_another_program, writable_by_others],
 )
 def test_a_file_that_cannot_be_trusted_counts_as_none(folder, monkeypatch, damage):
     impact()
@@ -101,7 +108,9 @@ def test_a_file_of_another_user_counts_as_none(folder, monkeypatch):
     user = os.getuid()
     monkeypatch.setattr(kept_programs.os, "getuid", lambda: user + 1)
     written = []
-    monkeypatch.setattr(kept_programs, "_write", lambda *arguments: written.append(arguments))
+    monkeypatch.setattr(
+        kept_programs, "_write", lambda *arguments: written.append(arguments)
+    )
     np.testing.assert_allclose(impact(), EXPECTED, rtol=1e-14)
     assert written
 
@@ -124,7 +133,9 @@ def test_precision_is_part_of_the_name(folder, precision):
 
 
 @pytest.mark.parametrize("place", ["mkstemp", "fdopen", "replace"])
-def test_a_full_disk_and_a_folder_to_be_read_only_leave_results_right(folder, monkeypatch, place):
+def test_a_full_disk_and_a_folder_to_be_read_only_leave_results_right(
+    folder, monkeypatch, place
+):
     def fails(*_, **__):
         raise OSError(28, "No space left on device")
 

@@ -27,7 +27,9 @@ def gliders(rng, slope=0.0, waves=0.0, fps=400, noise=3e-5):
     q = np.where(since < 0, [0.6, -0.2], [-0.1, 0.4]) * since + slope * since**2 / 2
     phases = rng.uniform(0, 6, (4, 2))
     lengths = rng.uniform(0.1, 0.2, (4, 2))
-    lens = waves / 2 * sum(np.sin(2 * np.pi * q / x + p) for x, p in zip(lengths, phases))
+    lens = (
+        waves / 2 * sum(np.sin(2 * np.pi * q / x + p) for x, p in zip(lengths, phases))
+    )
     return t, q + lens + noise * rng.normal(size=q.shape)
 
 
@@ -40,7 +42,9 @@ def test_the_covariance_of_waves_is_that_of_its_equation():
     rng = np.random.default_rng(0)
     t = np.sort(rng.random(20))
     starts = np.array([0, 8])
-    covariance = Errors(np.array([0.1]), np.array([0.7]), np.array([0.2])).of(0, t, starts)
+    covariance = Errors(np.array([0.1]), np.array([0.7]), np.array([0.2])).of(
+        0, t, starts
+    )
     dense = 0.01 * np.eye(20)
     for some in (slice(0, 8), slice(8, 20)):
         x = np.abs(t[some, None] - t[some]) / 0.2
@@ -49,7 +53,9 @@ def test_the_covariance_of_waves_is_that_of_its_equation():
     np.testing.assert_allclose(
         covariance.solve(columns), np.linalg.solve(dense, columns), rtol=1e-5, atol=1e-5
     )
-    parts = [np.linalg.slogdet(dense[some, some])[1] for some in (slice(0, 8), slice(8, 20))]
+    parts = [
+        np.linalg.slogdet(dense[some, some])[1] for some in (slice(0, 8), slice(8, 20))
+    ]
     np.testing.assert_allclose(covariance.log_det(), parts, rtol=1e-7)
 
 
@@ -110,7 +116,9 @@ def test_a_clock_that_errs_loses_no_impact():
         q = np.column_stack([np.interp(t, instants, x) for x in corners.T])
         q += 3e-4 * rng.normal(size=q.shape)
         track = ji.tracks.find_impacts(t + 3e-4 * rng.normal(size=t.size), q)
-        np.testing.assert_allclose([x.time for x in track.impacts], instants[1:-1], atol=0.01)
+        np.testing.assert_allclose(
+            [x.time for x in track.impacts], instants[1:-1], atol=0.01
+        )
 
 
 def test_coordinates_without_noise_and_in_pixels():
@@ -139,7 +147,9 @@ def test_gravity_that_is_not_known_at_low_rates(fps):
 
 def test_acceleration_may_be_known_of_some_coordinates():
     t, y = bounce(np.random.default_rng(7))
-    both = np.column_stack([0.2 * t, y]) + 1e-4 * np.random.default_rng(8).normal(size=(t.size, 2))
+    both = np.column_stack([0.2 * t, y]) + 1e-4 * np.random.default_rng(8).normal(
+        size=(t.size, 2)
+    )
     track = ji.tracks.find_impacts(t, both, acceleration=[0.0, None])
     assert track.acceleration[0] == 0
     assert abs(track.acceleration[1] + G) < 0.1
@@ -208,7 +218,9 @@ def test_the_time_grows_as_the_frames():
     """Ten times as many candidates' frames: the division of 40 000 is found, and right."""
     t = np.arange(40_000) / 400
     instants = np.array([11.3, 40.2, 77.7])
-    q = 0.3 * t + sum(j * np.maximum(t - x, 0) for j, x in zip((-0.5, 0.6, -0.3), instants))
+    q = 0.3 * t + sum(
+        j * np.maximum(t - x, 0) for j, x in zip((-0.5, 0.6, -0.3), instants)
+    )
     q = q + 1e-4 * np.random.default_rng(13).normal(size=t.size)
     track = ji.tracks.find_impacts(t, q)
     np.testing.assert_allclose([x.time for x in track.impacts], instants, atol=1e-3)

@@ -5,7 +5,9 @@ import pytest
 
 import jimpact as ji
 
-PLACES = np.array([[1.5, -2.0, 300.25], [1.75, -2.5, 290.5], [2.0, -3.0, 280.75]])  # [mm]
+PLACES = np.array(
+    [[1.5, -2.0, 300.25], [1.75, -2.5, 290.5], [2.0, -3.0, 280.75]]
+)  # [mm]
 LOST = 1  # the frame in which the second marker was not seen
 
 QUALISYS = """NO_OF_FRAMES\t3
@@ -44,7 +46,8 @@ def trc(rate="200.00", step=0.005, digits=6, unit="mm"):
     ]
     edge = [x if k != LOST else "\t\t" for k, x in enumerate(EDGE)]
     rows = [
-        f"{k + 1}\t{k * step:.{digits}f}\t{a}\t{b}\t" for k, (a, b) in enumerate(zip(ROWS, edge))
+        f"{k + 1}\t{k * step:.{digits}f}\t{a}\t{b}\t"
+        for k, (a, b) in enumerate(zip(ROWS, edge))
     ]
     return "\n".join([*head, *rows]) + "\n"
 
@@ -117,7 +120,11 @@ def test_places_units_and_times_of_motion_capture(tmp_path, kind):
     ):
         with pytest.raises(ValueError, match=words):
             ji.tracks.read(path, columns, **({"unit": "mm"} | unit))
-    for more, words in (({"rate": 100}, "200"), ({"time": "Time"}, "`time`"), ({"unit": "px"}, "")):
+    for more, words in (
+        ({"rate": 100}, "200"),
+        ({"time": "Time"}, "`time`"),
+        ({"unit": "px"}, ""),
+    ):
         with pytest.raises(ValueError, match=words):
             ji.tracks.read(path, "ball z", **(unit | more))
 
@@ -146,7 +153,9 @@ def test_times_of_trc_and_its_rate(tmp_path):
     """Three decimals at 120 Hz are steps of 8 and 9 ms: the times are those of the frames."""
     t, _ = ji.tracks.read(written(tmp_path, trc("120.00", 1 / 120, 3)), "ball z")
     np.testing.assert_allclose(t, np.arange(3) / 120, atol=1e-12)
-    with pytest.raises(ValueError, match=r"240 frames a second, but its times are 0\.0083"):
+    with pytest.raises(
+        ValueError, match=r"240 frames a second, but its times are 0\.0083"
+    ):
         ji.tracks.read(written(tmp_path, trc("240.00", 1 / 120)), "ball z")
 
 
@@ -218,7 +227,9 @@ def test_tables_without_names_and_steps_for_times(tmp_path):
 
 
 def test_two_takes_in_one_file_and_a_unit_that_a_name_states(tmp_path):
-    text = "t;height (cm)\n" + "\n".join(f"{x};{y}" for x, y in ((0, 1), (1, 2), (0.5, 3), (2, 4)))
+    text = "t;height (cm)\n" + "\n".join(
+        f"{x};{y}" for x, y in ((0, 1), (1, 2), (0.5, 3), (2, 4))
+    )
     path = written(tmp_path, text)
     with pytest.raises(ValueError, match="two takes"):
         ji.tracks.read(path, "height (cm)", time="t")

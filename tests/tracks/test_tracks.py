@@ -78,7 +78,9 @@ def test_good_tracks_have_few_warnings_and_bad_ones_have():
     rng, warned = np.random.default_rng(4), 0
     for _ in range(100):
         t, y, _ = ball(rng)
-        warned += bool(ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G).warnings)
+        warned += bool(
+            ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G).warnings
+        )
     assert warned <= 4  # 1 is expected; more than 4 happen once in 250
     t, y, _ = ball(rng)
     for bad, words in (
@@ -95,7 +97,9 @@ def test_good_tracks_have_few_warnings_and_bad_ones_have():
 def test_signs_units_and_gravity_that_are_wrong_are_told():
     rng = np.random.default_rng(14)
     t, y, first = ball(rng)
-    angle = np.where(t < first, 8.0, -5.0) * (t - first) + 0.005 * rng.normal(size=t.size)
+    angle = np.where(t < first, 8.0, -5.0) * (t - first) + 0.005 * rng.normal(
+        size=t.size
+    )
     for sigma in (1e-3, None):
         for bad, words in (
             (dict(q=-y), "curves the other way"),
@@ -172,7 +176,9 @@ def dragged(rng, drag=0.12, sideways=0.0):
     )  # fmt: skip
     first, before = fall.t_events[0][0], fall.y_events[0][0]
     after = before * [1, 1, 1, 0.7, 1, -0.8]
-    rise = solve_ivp(motion, (first, 2), after, rtol=1e-10, atol=1e-12, dense_output=True)
+    rise = solve_ivp(
+        motion, (first, 2), after, rtol=1e-10, atol=1e-12, dense_output=True
+    )
     q = np.where(t < first, fall.sol(t), rise.sol(t))[:3].T
     return t, q + 1e-3 * rng.normal(size=q.shape), before[3:], after[3:]
 
@@ -210,7 +216,9 @@ def test_drag_in_space_with_lost_frames_and_a_window():
         choice = {"sigma": 1e-3, "acceleration": [0, 0, -G], "drag": 0.2} | options
         (impact,) = ji.tracks.find_impacts(t, q, **choice).impacts
         error = np.concatenate([impact.pre - before, impact.post - after])
-        assert error @ np.linalg.solve(impact.covariance, error) < 25  # chi^2 of 6: once in 3000
+        assert (
+            error @ np.linalg.solve(impact.covariance, error) < 25
+        )  # chi^2 of 6: once in 3000
 
 
 @pytest.mark.parametrize(
@@ -242,7 +250,9 @@ def bounces(t, e, height=0.5):
     return y, np.array(times)
 
 
-@pytest.mark.parametrize(("fps", "noise"), [(60, 1e-3), (120, 1e-4), (240, 1e-3), (500, 1e-3)])
+@pytest.mark.parametrize(
+    ("fps", "noise"), [(60, 1e-3), (120, 1e-4), (240, 1e-3), (500, 1e-3)]
+)
 def test_a_ball_that_comes_to_rest_has_no_impacts_there(fps, noise):
     """Nor in the hand that holds it, half a second before."""
     for e, seed, sigma in ((0.3, 0, None), (0.8, 1, noise)):
@@ -257,7 +267,9 @@ def test_a_ball_that_comes_to_rest_has_no_impacts_there(fps, noise):
         # the last one may lie between the bounces that its flight cannot tell
         assert late[:-1].max(initial=0.0) < 1
         heights = G * np.diff(times) ** 2 / 8
-        assert len(found) >= np.argmax((heights < 10 * noise) | (np.diff(times) * fps < 10))
+        assert len(found) >= np.argmax(
+            (heights < 10 * noise) | (np.diff(times) * fps < 10)
+        )
         es = np.array([restitution(each) for each in track.impacts[:-1]])
         assert (np.abs(es[:, 0] - e) < 5 * es[:, 1]).all() if len(es) else True
         told = [line for line in track.warnings if "nothing is used" in line]
@@ -334,14 +346,19 @@ def test_a_square_that_lands_on_a_corner_is_a_shot_in_its_pose():
     q = pose + np.where(since < 0, before * since, after * since)
     q[:, 1] -= G * since[:, 0] ** 2 / 2
     q += 1e-4 * rng.normal(size=q.shape)
-    track = ji.tracks.find_impacts(t, q, acceleration=[0, -G, 0], units=["m", "m", "rad"])
+    track = ji.tracks.find_impacts(
+        t, q, acceleration=[0, -G, 0], units=["m", "m", "rad"]
+    )
     shots = track.experiments(body)
     assert shots.units == ("m/s", "m/s", "rad/s")
     assert shots.contacts.tolist() == [1]
     fit = ji.fit(ji.Newton(0.8, friction=0.0), None, shots)
     assert abs(fit.value[0] - 0.5) < 4 * fit.standard_error[0]
     high = ji.tracks.find_impacts(
-        t, q + np.array([0.0, 0.05, 0.0]), acceleration=[0, -G, 0], units=["m", "m", "rad"]
+        t,
+        q + np.array([0.0, 0.05, 0.0]),
+        acceleration=[0, -G, 0],
+        units=["m", "m", "rad"],
     )
     with pytest.raises(ValueError, match="closed"):
         high.experiments(body)
@@ -420,7 +437,9 @@ def test_frames_lost_by_turns():
     """Each second frame of a coordinate: no three in a row, the instant and velocities are found."""
     t = np.arange(80) / 200
     q = np.where(t < 0.203, 0.3 - 1.5 * t, -0.0045 + 0.9 * (t - 0.203))
-    q = np.where(np.arange(80) % 2, q + 1e-4 * np.random.default_rng(2).normal(size=80), np.nan)
+    q = np.where(
+        np.arange(80) % 2, q + 1e-4 * np.random.default_rng(2).normal(size=80), np.nan
+    )
     for sigma in (None, 1e-4):
         (impact,) = ji.tracks.find_impacts(t, q, sigma).impacts
         np.testing.assert_allclose([*impact.pre, *impact.post], [-1.5, 0.9], atol=0.01)
@@ -431,7 +450,9 @@ def test_frames_lost_by_turns():
 def test_impacts_of_unknown_gravity_are_all_found():
     """Four bounces at 500 frames a second, one frame in fifteen lost."""
     t, speed, e = np.arange(618) / 500, 9.80665 * 0.38853, 0.558
-    at = 0.38853 + 2 * 0.38853 * np.concatenate([[0.0], np.cumsum(e ** np.arange(1, 4))])
+    at = 0.38853 + 2 * 0.38853 * np.concatenate(
+        [[0.0], np.cumsum(e ** np.arange(1, 4))]
+    )
     flight = np.searchsorted(at, t)
     since = np.where(flight > 0, t - at[flight - 1], t)
     y = np.where(flight > 0, speed * e**flight * since, 0.7402) - 9.80665 / 2 * since**2
@@ -468,7 +489,9 @@ def test_bad_bounce_times_are_refused(times):
         ji.tracks.bounce_times(times, 0.001)
 
 
-TRACKER = "#multi:\n\tball\t\t\nt\tx #1\ty\t\n0,00\t1,5\t2,0\n0,01\t\t\n0,02\t1,7\t2,2\n"
+TRACKER = (
+    "#multi:\n\tball\t\t\nt\tx #1\ty\t\n0,00\t1,5\t2,0\n0,01\t\t\n0,02\t1,7\t2,2\n"
+)
 LOGGER = '"Run 1: Time (s)";"Run 1: Height (mm)"\n0.0;1500\n0.010;nan\n0.020;1700;\n'
 CAPTURE = "FREQUENCY 100\nLABELS 2\n\nX Y\n1500 2000\n- -\n1700 2200\n"
 
@@ -502,7 +525,9 @@ def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
         ({"decimal": "x"}, "decimal"),
     ):
         with pytest.raises(ValueError, match=words):
-            ji.tracks.read(path, **({"columns": ["X"], "rate": 100, "unit": "mm"} | arguments))
+            ji.tracks.read(
+                path, **({"columns": ["X"], "rate": 100, "unit": "mm"} | arguments)
+            )
     path.write_text("X\n1,5\n")
     with pytest.raises(ValueError, match="line 2, column `X`"):
         ji.tracks.read(path, "X", rate=100, unit="m")
@@ -534,7 +559,9 @@ acceleration = -9.80665
 def written(folder, old="", new=""):
     """A study of a ball that a camera saw."""
     _, y, _ = ball(np.random.default_rng(11))
-    (folder / "ball.txt").write_text("height\n" + "\n".join(f"{100 * x:.3f}" for x in y))
+    (folder / "ball.txt").write_text(
+        "height\n" + "\n".join(f"{100 * x:.3f}" for x in y)
+    )
     path = folder / "study.toml"
     path.write_text(SEEN.replace(old, new))
     return path
@@ -546,7 +573,9 @@ def test_a_study_of_a_track_finds_its_impacts(tmp_path):
     assert abs(restitution(impact)[0] - 0.8) < 5 * restitution(impact)[1]
     np.testing.assert_allclose(study.experiments.pre[0], impact.pre)
     np.testing.assert_allclose(study.experiments.covariance[0], impact.covariance)
-    free = ji.read_study(written(tmp_path, "acceleration = -9.80665", 'acceleration = "unknown"'))
+    free = ji.read_study(
+        written(tmp_path, "acceleration = -9.80665", 'acceleration = "unknown"')
+    )
     np.testing.assert_allclose(free.track.acceleration, -G, atol=0.1)
     assert ji.read_study("ball_track.toml").experiments.pre.shape == (3, 1)
 
@@ -584,13 +613,21 @@ def test_a_study_of_bounces(tmp_path):
         ("rate = 120", 'rate = "fast"', "`rate` in .* must be a number"),
         ("rate = 120", "framerate = 120", "Did you mean frame"),
         ('columns = "height"', 'columns = "hight"', "`hight` is missing"),
-        ('columns = "height"', "columns = 3", "`columns` in .* must be a text or a list"),
+        (
+            'columns = "height"',
+            "columns = 3",
+            "`columns` in .* must be a text or a list",
+        ),
         ("acceleration = -9.80665", "acceleration = true", "`acceleration` in"),
         ("acceleration = -9.80665", "sigma = -1.0", "`sigma` must"),
         ("acceleration = -9.80665", "contact = -0.1", "`contact` must"),
         ("acceleration = -9.80665", "shortest = 2", "`shortest` must"),
         ("acceleration = -9.80665", "near_m = 0.001", "`near_m` in .* for bodies"),
-        ("masses_kg = [0.1]", "masses_kg = [0.1, 0.1]", "`columns` in .* 2 coordinates"),
+        (
+            "masses_kg = [0.1]",
+            "masses_kg = [0.1, 0.1]",
+            "`columns` in .* 2 coordinates",
+        ),
         ("rate = 120", 'rate = 120\n[data]\nfile = "x.csv"', r"one table of shots"),
     ],
 )

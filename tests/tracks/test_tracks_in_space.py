@@ -37,7 +37,9 @@ def freely(inertia):
         found = np.zeros((len(since), 4))
         for some, step in ((since < 0, -1), (since >= 0, 1)):
             times, start = since[some][::step], scalar_first(TURN)
-            path = solve_ivp(rates, (0, times[-1]), start, t_eval=times, rtol=1e-10, atol=1e-12)
+            path = solve_ivp(
+                rates, (0, times[-1]), start, t_eval=times, rtol=1e-10, atol=1e-12
+            )
             found[some] = path.y.T[::step]
         return Rotation.from_quat(np.roll(found, -1, axis=1))
 
@@ -47,7 +49,9 @@ def freely(inertia):
 def landed(body, turns=evenly, e=0.6):
     """A toss: poses without noise at times, and v+ of its impact at AT by a law."""
     pose = np.asarray(body.touching(scalar_first(TURN)))
-    after = ji.impact(ji.Newton(e, friction=0.2), body.scenes([pose])[0], BEFORE).velocity
+    after = ji.impact(
+        ji.Newton(e, friction=0.2), body.scenes([pose])[0], BEFORE
+    ).velocity
     after = np.asarray(after)
 
     def poses(t):
@@ -68,12 +72,17 @@ def seen(poses, rng):
     places, turns = poses(t)
     noise = rng.normal(size=(len(t), 6)) * NOISE
     return t, np.hstack(
-        [places + noise[:, :3], scalar_first(turns * Rotation.from_rotvec(noise[:, 3:]))]
+        [
+            places + noise[:, :3],
+            scalar_first(turns * Rotation.from_rotvec(noise[:, 3:])),
+        ]
     )
 
 
 def found(t, q, sigma=NOISE, order="wxyz", **options):
-    return ji.tracks.find_impacts(t, q, sigma, acceleration=[0, 0, -G], quaternion=order, **options)
+    return ji.tracks.find_impacts(
+        t, q, sigma, acceleration=[0, 0, -G], quaternion=order, **options
+    )
 
 
 @pytest.mark.slow
@@ -103,18 +112,28 @@ def test_the_error_is_the_least_one():
         place, turn, v0, v1, at = np.split(x, [3, 6, 12, 18])
         since = t - at
         v = np.where(since[:, None] < 0, v0, v1)
-        places = place + v[:, :3] * since[:, None] - G * np.array([0, 0, 0.5]) * since[:, None] ** 2
-        start = Rotation.from_quat(np.roll(impact.q[3:], -1)) * Rotation.from_rotvec(turn)
+        places = (
+            place
+            + v[:, :3] * since[:, None]
+            - G * np.array([0, 0, 0.5]) * since[:, None] ** 2
+        )
+        start = Rotation.from_quat(np.roll(impact.q[3:], -1)) * Rotation.from_rotvec(
+            turn
+        )
         return places, start * Rotation.from_rotvec(v[:, 3:] * since[:, None])
 
-    x = np.concatenate([impact.q[:3], np.zeros(3), impact.pre, impact.post, [impact.time]])
+    x = np.concatenate(
+        [impact.q[:3], np.zeros(3), impact.pre, impact.post, [impact.time]]
+    )
     (places, turns), slopes = poses(x), []
     for step in 1e-6 * np.eye(19):
         other, turned = poses(x + step)
         change = np.hstack([other - places, (turns.inv() * turned).as_rotvec()])
         slopes.append((change / NOISE).ravel() / 1e-6)
     least = np.linalg.inv(np.array(slopes) @ np.transpose(slopes))[6:18, 6:18]
-    np.testing.assert_allclose(impact.covariance, least, rtol=0.15, atol=0.03 * least.max())
+    np.testing.assert_allclose(
+        impact.covariance, least, rtol=0.15, atol=0.03 * least.max()
+    )
 
 
 def test_a_brick_turns_freely_between_impacts():
@@ -130,7 +149,9 @@ def test_a_brick_turns_freely_between_impacts():
     assert track.experiments(BRICK).contacts.tolist() == [1]
     for sigma in (NOISE, None):
         as_sphere = found(t, q, sigma)
-        assert any("turn freely" in x or "residuals of" in x for x in as_sphere.warnings)
+        assert any(
+            "turn freely" in x or "residuals of" in x for x in as_sphere.warnings
+        )
     with pytest.raises(ValueError, match=r"moments of inertia.*inertia=body\.inertia"):
         as_sphere.experiments(BRICK)
 
@@ -145,7 +166,9 @@ def test_both_orders_of_quaternions_and_both_signs():
     for each in (found(t, flipped), other):
         np.testing.assert_allclose(each.impacts[0].pre, track.impacts[0].pre, rtol=1e-9)
         np.testing.assert_allclose(each.covariance, track.covariance, rtol=1e-6)
-    np.testing.assert_allclose(np.abs(other.impacts[0].q), np.abs(track.impacts[0].q), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.abs(other.impacts[0].q), np.abs(track.impacts[0].q), rtol=1e-9
+    )
     shots, law = other.experiments(CUBE), ji.Newton(0.5, friction=0.1)
     fit = ji.fit(law, None, shots, free=("restitution", "friction"), starts=1)
     assert fit.warnings == ()

@@ -25,7 +25,11 @@ from when_written import written
 import jimpact as ji
 
 PAGE = Path(__file__).parents[2] / "docs" / "cube.md"
-BOX = ([0.102] * 3, 0.37, [9.57e-4, 9.57e-4, 9.09e-4])  # sizes [m], mass [kg], inertia [kg m^2]
+BOX = (
+    [0.102] * 3,
+    0.37,
+    [9.57e-4, 9.57e-4, 9.09e-4],
+)  # sizes [m], mass [kg], inertia [kg m^2]
 CENTRE, ROUNDING = 0.0057, 0.0036  # of mass above the middle, of the corners [m]
 NEAR = 2e-3  # [m] a corner so far above the lowest one counts as the second; board and cube are flat to 1.4
 FOLDS = 5  # groups of tosses; one is predicted by a fit to the others
@@ -36,10 +40,22 @@ RTOL = 1e-4  # of impacts, a twentieth of noise over speed
 # Logarithms of scatter, of noise over that of the camera and of nu, where they are sought. A scatter
 # of 1e-3 is none; nu = 150 is normal.
 SIZES = (-7.0, 5.0)
-RESAMPLES = 2000  # of the tosses; ten times more change the intervals by less than .05 %
+RESAMPLES = (
+    2000  # of the tosses; ten times more change the intervals by less than .05 %
+)
 # Tosses that are in the source twice, turned about the vertical: the second one is the first.
 COPIES = {
-    **{370: 41, 371: 42, 327: 162, 528: 163, 530: 165, 531: 166, 532: 167, 301: 172, 302: 173},
+    **{
+        370: 41,
+        371: 42,
+        327: 162,
+        528: 163,
+        530: 165,
+        531: 166,
+        532: 167,
+        301: 172,
+        302: 173,
+    },
     **{453: 226, 457: 230, 413: 321, 415: 323, 546: 363, 558: 492},
 }
 
@@ -136,7 +152,11 @@ def of_law(law: ji.Law, data: ji.Experiments, free: tuple[str, ...]) -> Model:
     low, high = problem.domains.T
     bounds = (low, high)
     return Model(
-        problem.names, np.asarray(problem.start), bounds, problem.residual, problem.jacobian
+        problem.names,
+        np.asarray(problem.start),
+        bounds,
+        problem.residual,
+        problem.jacobian,
     )
 
 
@@ -159,7 +179,9 @@ def models(all_impacts: Impacts) -> dict[str, Callable[[], Model]]:
         "LZB": lambda: of_law(lzb, data, pair),
         "Compliant": lambda: of_law(soft, gaps, (*pair, stiff)),
         "LZB, e falls": lambda: of_law(falling(lzb), data, (*pair, falls)),
-        "Compliant, e falls": lambda: of_law(falling(soft), gaps, (*pair, stiff, falls)),
+        "Compliant, e falls": lambda: of_law(
+            falling(soft), gaps, (*pair, stiff, falls)
+        ),
     }
 
 
@@ -186,13 +208,17 @@ def resampled(toss: np.ndarray, seed: int = 0) -> list[np.ndarray]:
     return [np.concatenate([members[i] for i in draw]) for draw in draws]
 
 
-def median_and_interval(error: np.ndarray, draws: list[np.ndarray]) -> tuple[float, float, float]:
+def median_and_interval(
+    error: np.ndarray, draws: list[np.ndarray]
+) -> tuple[float, float, float]:
     """Median, and the 95 % interval of the medians of the draws."""
     low, high = np.quantile([np.median(error[draw]) for draw in draws], [0.025, 0.975])
     return float(np.median(error)), float(low), float(high)
 
 
-def difference(a: np.ndarray, b: np.ndarray, draws: list[np.ndarray]) -> tuple[float, float, float]:
+def difference(
+    a: np.ndarray, b: np.ndarray, draws: list[np.ndarray]
+) -> tuple[float, float, float]:
     """Median of b minus that of a, and its 95 % interval: the same draws for both."""
     each = [np.median(b[draw]) - np.median(a[draw]) for draw in draws]
     low, high = np.quantile(each, [0.025, 0.975])
@@ -285,12 +311,16 @@ friction have little to explain, and on two corners what is left does not go wit
 """
 
 
-def page(all_impacts: Impacts, made: dict[str, Callable[[], Model]], print: Any = print) -> str:
+def page(
+    all_impacts: Impacts, made: dict[str, Callable[[], Model]], print: Any = print
+) -> str:
     """Text of the page."""
     two, toss = all_impacts.two, all_impacts.toss
     kinds = {"one corner": ~two, "two corners": two}
     draws = {kind: resampled(toss[chosen]) for kind, chosen in kinds.items()}
-    text = HEAD.format(one=(~two).sum(), two=two.sum(), tosses=len(set(toss)), folds=FOLDS)
+    text = HEAD.format(
+        one=(~two).sum(), two=two.sum(), tosses=len(set(toss)), folds=FOLDS
+    )
     rows = [
         "| law | numbers, fitted to all | one corner | two corners | two, fitted |",
         "|---" * 5 + "|",
@@ -301,7 +331,9 @@ def page(all_impacts: Impacts, made: dict[str, Callable[[], Model]], print: Any 
         whole = model.fitted(np.ones(len(two)), model.start)
         errors[name] = error = held_out(model, whole, toss)
         cells = [
-            "{:.2f} ({:.2f} to {:.2f})".format(*median_and_interval(error[chosen], draws[kind]))
+            "{:.2f} ({:.2f} to {:.2f})".format(
+                *median_and_interval(error[chosen], draws[kind])
+            )
             for kind, chosen in kinds.items()
         ]
         numbers = ", ".join(f"{n} {v:.3g}" for n, v in zip(model.names, whole))
@@ -315,17 +347,23 @@ def page(all_impacts: Impacts, made: dict[str, Callable[[], Model]], print: Any 
         if name == "Compliant, e falls":
             scattered += scatter_section(all_impacts, model, whole)
             print(scattered)
-    return "\n".join([text + "\n".join(rows), "", differences(errors, kinds, draws), scattered])
+    return "\n".join(
+        [text + "\n".join(rows), "", differences(errors, kinds, draws), scattered]
+    )
 
 
-def differences(errors: dict[str, np.ndarray], kinds: dict[str, Any], draws: dict[str, Any]) -> str:
+def differences(
+    errors: dict[str, np.ndarray], kinds: dict[str, Any], draws: dict[str, Any]
+) -> str:
     """Section: each law beside LZB."""
     rows = [
         "## Differences from LZB",
         "",
         "Of the medians held out, paired: the same tosses are drawn for both",
     ]
-    rows[-1] += " laws. An interval\nthat contains 0 does not show which law is better.\n"
+    rows[-1] += (
+        " laws. An interval\nthat contains 0 does not show which law is better.\n"
+    )
     rows += ["| law | one corner | two corners |", "|---" * 3 + "|"]
     for name, error in errors.items():
         if name != "LZB" and "LZB" in errors:
@@ -342,7 +380,9 @@ def differences(errors: dict[str, np.ndarray], kinds: dict[str, Any], draws: dic
 def torsion_section(all_impacts: Impacts, residual: np.ndarray) -> str:
     """Section: what a free moment about the normal would explain of residuals (K, 6) by energy."""
     up = Rotation.from_quat(np.roll(all_impacts.q[:, 3:], -1, axis=1)).as_matrix()[:, 2]
-    moment = up / np.sqrt(np.array(BOX[2]))  # in the body's frame, as the angular velocity
+    moment = up / np.sqrt(
+        np.array(BOX[2])
+    )  # in the body's frame, as the angular velocity
     moment /= np.linalg.norm(moment, axis=1, keepdims=True)
     explained = np.sum(residual[:, 3:] * moment, axis=1) ** 2
     squares, two = np.sum(residual**2, axis=1), all_impacts.two
@@ -362,7 +402,11 @@ def scatter_section(all_impacts: Impacts, model: Model, x: np.ndarray) -> str:
     ]
     for kind, chosen in (("one", ~all_impacts.two), ("two", all_impacts.two)):
         sizes, inside = scatter_of(*(part[chosen] for part in parts))
-        cells = [kind, *(f"{s:.3f}" for s in sizes), *(f"{p:.1f}" for p in inside.values())]
+        cells = [
+            kind,
+            *(f"{s:.3f}" for s in sizes),
+            *(f"{p:.1f}" for p in inside.values()),
+        ]
         rows.append(f"| {' | '.join(cells)} |")
     return SCATTER + "\n".join(rows) + "\n"
 
@@ -375,7 +419,9 @@ def main(names: list[str]) -> None:
         from cube_mujoco import of_mujoco
 
         for name, numbers in (("MuJoCo", 3), ("MuJoCo, seven numbers", 7)):
-            made[name] = partial(of_mujoco, all_impacts, heights(all_impacts.q), numbers)
+            made[name] = partial(
+                of_mujoco, all_impacts, heights(all_impacts.q), numbers
+            )
     except ImportError:
         print("MuJoCo is not installed: its row is left out.")
     text = page(all_impacts, {name: made[name] for name in names or made})

@@ -30,14 +30,17 @@ HIGH = np.array([0.05, 3.0, 2.0, 0.9999, 0.9999, 0.02, 0.1])
 def scene() -> Any:
     """The cube above a plane; its frame is that of the inertia, at the centre of mass."""
     spheres = [
-        f'<geom type="sphere" size="{ROUNDING}" pos="{x} {y} {z}"/>' for x, y, z in cube().points[0]
+        f'<geom type="sphere" size="{ROUNDING}" pos="{x} {y} {z}"/>'
+        for x, y, z in cube().points[0]
     ]
     inertia = " ".join(map(str, BOX[2]))
     text = SCENE.format(mass=BOX[1], inertia=inertia, corners="".join(spheres))
     return mujoco.MjModel.from_xml_string(text)
 
 
-def after(model: Any, state: Any, q: np.ndarray, part: np.ndarray, v: np.ndarray) -> np.ndarray:
+def after(
+    model: Any, state: Any, q: np.ndarray, part: np.ndarray, v: np.ndarray
+) -> np.ndarray:
     """v+ of an impact: until none of the corners that take part touches or approaches."""
     model.geom_contype[1:] = model.geom_conaffinity[1:] = part
     mujoco.mj_resetData(model, state)

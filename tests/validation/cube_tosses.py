@@ -16,7 +16,11 @@ import jimpact as ji
 
 CENTRE = np.array([0.0, 0.0, 0.0057])  # of mass, from the middle [m]
 CUBE = ji.Box(
-    [0.102] * 3, 0.37, [9.57e-4, 9.57e-4, 9.09e-4], centre=CENTRE.tolist(), rounding=0.0036
+    [0.102] * 3,
+    0.37,
+    [9.57e-4, 9.57e-4, 9.09e-4],
+    centre=CENTRE.tolist(),
+    rounding=0.0036,
 )
 # Of places [m] and turns [rad]. The noise from frame to frame is a third of it; the rest is what
 # makes flights not quite free: frames that are not quite evenly spaced.
@@ -52,7 +56,9 @@ def track_of(t: np.ndarray, q: np.ndarray) -> ji.tracks.Track:
     )
 
 
-def compared(stored: dict[str, np.ndarray], tosses: np.ndarray) -> tuple[list[int], np.ndarray]:
+def compared(
+    stored: dict[str, np.ndarray], tosses: np.ndarray
+) -> tuple[list[int], np.ndarray]:
     """Counts, and differences from published velocities (K, 12) in their errors beside those.
 
     Counts are impacts, shots, published impacts, those found as impacts and as shots.
@@ -95,7 +101,9 @@ def main(path: str, count: int) -> None:
     tosses, begun = np.unique(stored["toss"])[:count], time.perf_counter()
     (impacts, shots, asked, found, kept), apart = compared(stored, tosses)
     took = time.perf_counter() - begun
-    print(f"{len(tosses)} tosses, {took:.0f} s: {impacts} impacts, {shots} of them shots")
+    print(
+        f"{len(tosses)} tosses, {took:.0f} s: {impacts} impacts, {shots} of them shots"
+    )
     print(f"of {asked} published impacts {found} are found, {kept} as shots")
     sizes = np.median(np.abs(apart), axis=0)
     print("medians of differences before and after [m/s, rad/s]:", sizes[0].round(4))

@@ -23,13 +23,18 @@ ARM = SIDE / 6**0.5  # radius of gyration [m]: an angle times it is a length
 BLOCK = ji.Block(SIDE, SIDE)
 NEAR = 2e-3  # [m] the square touches if a corner is nearer; noise is .04 mm, corners dip to -3 mm
 ARC = 7  # frames; poses that give a state, and the shortest flight that gives one. 70 are none
-LEAD, TAIL = 2, 8  # frames before and after a hit that a fit sees; 100 are several impacts
+LEAD, TAIL = (
+    2,
+    8,
+)  # frames before and after a hit that a fit sees; 100 are several impacts
 STEP = 4e-4  # [s] of time stepping, .4 mm of fall; ten times more is a frame
 EVENTS = 200  # of a drop, at most; a drop has some 60
 SOFT = 0.003  # [m] beyond, an error pulls as its absolute value; ten times more: scatter decides
 FOLDS = 5
 RESAMPLES = 2000  # of the drops
-MEMBERS = 8  # simulations of a start from slightly other states; ten times more: finer shares
+MEMBERS = (
+    8  # simulations of a start from slightly other states; ten times more: finer shares
+)
 # Standard errors of a state from an arc: position [m, m, rad], velocity [m/s, m/s, rad/s].
 ERRORS = np.array([[1e-5, 3e-5, 5e-4], [7e-3, 6e-3, 0.1]])
 OFF = -5e-3  # [m] a corner lower than that is beside the table
@@ -67,7 +72,9 @@ def state(flight: np.ndarray, at: int) -> np.ndarray:
     """Position and velocity (2, 3) at a frame, by the arc through the poses (N, 3) of a flight."""
     t = FRAME * (np.arange(len(flight)) - at)
     straight = flight + np.array([0, GRAVITY / 2, 0]) * t[:, None] ** 2
-    return np.linalg.lstsq(np.stack([np.ones(len(t)), t], axis=1), straight, rcond=None)[0]
+    return np.linalg.lstsq(
+        np.stack([np.ones(len(t)), t], axis=1), straight, rcond=None
+    )[0]
 
 
 def flights(poses: np.ndarray) -> list[tuple[int, int]]:
@@ -82,7 +89,9 @@ def hits(poses: np.ndarray) -> list[Hit]:
     for k, q in enumerate(poses):
         for a, b in flights(q):
             at = state(q[a:b], b - LEAD - a)
-            if b + TAIL <= LAST and lowest(at[0]) > 0:  # else no arc: a hit between two frames
+            if (
+                b + TAIL <= LAST and lowest(at[0]) > 0
+            ):  # else no arc: a hit between two frames
                 found.append(Hit(k, b - LEAD, b, at))
     return found
 
@@ -111,11 +120,17 @@ class Simulator:
     def errors(self, x: np.ndarray, found: list[Hit], poses: np.ndarray) -> np.ndarray:
         """Of the poses after each hit (K, TAIL, 3) [m]."""
         states = np.stack([hit.state for hit in found])
-        own = np.stack([poses[hit.drop, hit.frame + 1 : hit.frame + 1 + TAIL] for hit in found])
-        simulated = self.simulate(np.broadcast_to(x, (len(found), len(x))), states, LEAD + TAIL)
+        own = np.stack(
+            [poses[hit.drop, hit.frame + 1 : hit.frame + 1 + TAIL] for hit in found]
+        )
+        simulated = self.simulate(
+            np.broadcast_to(x, (len(found), len(x))), states, LEAD + TAIL
+        )
         return (simulated[:, LEAD + 1 :] - own) * np.array([1, 1, ARM])
 
-    def fitted(self, found: list[Hit], poses: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    def fitted(
+        self, found: list[Hit], poses: np.ndarray, starts: np.ndarray
+    ) -> np.ndarray:
         """Numbers with which poses after hits are predicted best, of several starts."""
         fits = [
             least_squares(
@@ -137,7 +152,9 @@ def of_jimpact() -> Simulator:
         options = {"samples": frames + 1, "step": STEP, "max_events": EVENTS}
         law = ji.Moreau(x[0], friction=x[1])
         ends = frames * FRAME
-        return ji.simulate(system, law, *state, ends, method="time_stepping", **options).q
+        return ji.simulate(
+            system, law, *state, ends, method="time_stepping", **options
+        ).q
 
     run = jax.jit(jax.vmap(one, in_axes=(0, 0, None)), static_argnums=2)
 
@@ -198,11 +215,15 @@ def compared(name: str, tables: np.ndarray, drops: int) -> list[str]:
     cells = [cell(lambda draw, t=t: centre(name, t[draw]), "") for t in tables]
     if len(tables) > 1:
         a, b = tables[:2]
-        cells.append(cell(lambda draw: centre(name, b[draw]) - centre(name, a[draw]), "+"))
+        cells.append(
+            cell(lambda draw: centre(name, b[draw]) - centre(name, a[draw]), "+")
+        )
     return cells
 
 
-def held_out(made: Simulator, found: list[Hit], poses: np.ndarray) -> tuple[Any, np.ndarray]:
+def held_out(
+    made: Simulator, found: list[Hit], poses: np.ndarray
+) -> tuple[Any, np.ndarray]:
     """Numbers fitted to all drops, and (FOLDS, P) to those of the other groups each."""
     whole = made.fitted(found, poses, made.starts)
     parts = [[hit for hit in found if hit.drop % FOLDS != k] for k in range(FOLDS)]
@@ -222,7 +243,9 @@ def spread(simulated: np.ndarray, begin: list[Hit], poses: np.ndarray) -> np.nda
     errors = np.full((len(begin), HORIZON), np.nan)
     for row, q, hit in zip(errors, simulated, begin):
         own = poses[hit.drop, hit.frame :][:HORIZON]
-        row[: len(own)] = np.degrees(np.abs(q[hit.frame - hit.start :][: len(own), 2] - own[:, 2]))
+        row[: len(own)] = np.degrees(
+            np.abs(q[hit.frame - hit.start :][: len(own), 2] - own[:, 2])
+        )
     return np.nanmedian(errors, axis=0)
 
 
@@ -230,7 +253,9 @@ def agreement(simulated: np.ndarray, begin: list[Hit], poses: np.ndarray) -> np.
     """Of each start (K, 2): share of its members (M, K, S, 3) on the commonest side, is it right."""
     rows = []
     for k, hit in enumerate(begin):
-        counts = np.bincount(sides(simulated[:, k, LAST - hit.start]).astype(int), minlength=4)
+        counts = np.bincount(
+            sides(simulated[:, k, LAST - hit.start]).astype(int), minlength=4
+        )
         right = counts.argmax() == sides(poses[hit.drop, LAST])
         rows.append((counts.max() / len(simulated), right))
     return np.array(rows)
@@ -248,7 +273,9 @@ class Rocking(NamedTuple):
 
 def accelerations(q: np.ndarray) -> np.ndarray:
     """(x'', y'', theta'') of a square that turns about its lower corner, which sticks [m/s^2]."""
-    angle = (q[2] + np.pi / 4) % (np.pi / 2) + np.pi / 4  # from the lower corner to the centre
+    angle = (q[2] + np.pi / 4) % (
+        np.pi / 2
+    ) + np.pi / 4  # from the lower corner to the centre
     radius = SIDE / 2**0.5
     turn = -GRAVITY * radius * np.cos(angle) / (ARM**2 + radius**2)
     return turn * np.array([-radius * np.sin(angle), radius * np.cos(angle), 1.0])
@@ -260,7 +287,9 @@ def rates(q: np.ndarray, at: float) -> np.ndarray:
     turn = accelerations(q[len(q) // 2]) if rests else np.array([0, -GRAVITY, 0])
     t = FRAME * (np.arange(len(q)) - at)
     straight = q - turn * t[:, None] ** 2 / 2
-    return np.linalg.lstsq(np.stack([np.ones(len(t)), t], axis=1), straight, rcond=None)[0][1]
+    return np.linalg.lstsq(
+        np.stack([np.ones(len(t)), t], axis=1), straight, rcond=None
+    )[0][1]
 
 
 def rocking(poses: np.ndarray) -> Rocking:
@@ -270,7 +299,10 @@ def rocking(poses: np.ndarray) -> Rocking:
         tilt = (q[:, 2] + np.pi / 4) % (np.pi / 2) - np.pi / 4
         for i in range(WINDOW, len(q) - WINDOW - 1):
             before, after = q[i - WINDOW : i], q[i + 1 : i + 1 + WINDOW]
-            if lowest(before).max() > ON or abs(tilt[i]) > np.abs(tilt[[i - 1, i + 1]]).min():
+            if (
+                lowest(before).max() > ON
+                or abs(tilt[i]) > np.abs(tilt[[i - 1, i + 1]]).min()
+            ):
                 continue
             start = rates(before, WINDOW)
             at = (
@@ -279,7 +311,9 @@ def rocking(poses: np.ndarray) -> Rocking:
             if abs(start[2]) < SLOWEST or abs(at) > 1:
                 continue
             end = rates(after, at - 1)
-            arm = SIDE / 2 * np.sign(start[2])  # of the corner that hits: it is on the right if < 0
+            arm = (
+                SIDE / 2 * np.sign(start[2])
+            )  # of the corner that hits: it is on the right if < 0
             hit = SIDE * abs(start[2])
             gaps = (end[1] + np.array([-1, 1]) * arm * end[2]) / hit
             rows.append((k, start[2], end[2], *gaps))
@@ -337,13 +371,20 @@ def row(*cells: Any) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def predictions(made: dict[str, Simulator], poses: np.ndarray) -> tuple[list[str], dict[str, Any]]:
+def predictions(
+    made: dict[str, Simulator], poses: np.ndarray
+) -> tuple[list[str], dict[str, Any]]:
     """Tables of fits and of predictions, and the curves of the picture."""
     found, curves = hits(poses), {}
-    numbers, lines = {}, [row("simulator", "numbers, fitted to all drops"), row("---", "---")]
+    numbers, lines = (
+        {},
+        [row("simulator", "numbers, fitted to all drops"), row("---", "---")],
+    )
     for name, simulator in made.items():
         whole, numbers[name] = held_out(simulator, found, poses)
-        lines.append(row(name, ", ".join(f"{n} {v:.3g}" for n, v in zip(simulator.names, whole))))
+        lines.append(
+            row(name, ", ".join(f"{n} {v:.3g}" for n, v in zip(simulator.names, whole)))
+        )
     lines += [
         "",
         row("start", "what", "starts", *made, "difference"),
@@ -360,7 +401,9 @@ def predictions(made: dict[str, Simulator], poses: np.ndarray) -> tuple[list[str
             curves[f"{kind}, {name}"] = spread(simulated, begin, poses)
         for what in tables[0][0]:
             values = np.array([[each[what] for each in table] for table in tables])
-            values = values[:, np.isfinite(values).all(axis=0)]  # hits that all simulators have
+            values = values[
+                :, np.isfinite(values).all(axis=0)
+            ]  # hits that all simulators have
             count = values.shape[1]
             lines.append(row(kind, what, count, *compared(what, values, count)))
         drawn = ensemble(made["jimpact"], numbers["jimpact"][group], begin)
@@ -374,7 +417,9 @@ def agreements(curves: dict[str, Any]) -> list[str]:
     for kind in KINDS:
         share, right = curves[f"{kind}, agreement"].T
         for words, chosen in (("all", share == 1), ("not all", share < 1)):
-            lines.append(row(kind, words, chosen.sum(), f"{100 * right[chosen].mean():.0f}"))
+            lines.append(
+                row(kind, words, chosen.sum(), f"{100 * right[chosen].mean():.0f}")
+            )
     return lines
 
 
@@ -406,12 +451,19 @@ def edges() -> list[str]:
     square, lines = ji.data.square_impacts(), []
     for words, contacts in (("a corner", 1), ("an edge (two corners within 2 mm)", 2)):
         shots = square.only(square.contacts == contacts)
-        plain = ji.Experiments(shots.pre, shots.post, scenes=shots.scenes, units=shots.units)
+        plain = ji.Experiments(
+            shots.pre, shots.post, scenes=shots.scenes, units=shots.units
+        )
         law, free = ji.Moreau(0.5, friction=0.2), ("restitution", "friction")
         fit = ji.fit(law, None, plain, free, starts=1, search=ji.Search(loss="huber"))
         (e, mu), (d, dmu) = fit.value, fit.standard_error
-        lines.append(row(words, len(plain.pre), f"{e:.2f} +- {d:.2f}", f"{mu:.2f} +- {dmu:.2f}"))
-    head = ["Impacts cut out of the drops (`ji.data.square_impacts()`), Moreau's law:", ""]
+        lines.append(
+            row(words, len(plain.pre), f"{e:.2f} +- {d:.2f}", f"{mu:.2f} +- {dmu:.2f}")
+        )
+    head = [
+        "Impacts cut out of the drops (`ji.data.square_impacts()`), Moreau's law:",
+        "",
+    ]
     return [*head, row("impact on", "shots", "e", "mu"), row(*["---"] * 4), *lines]
 
 
@@ -419,7 +471,11 @@ def main() -> None:
     """Write the page and the numbers of its picture."""
     poses = drops()
     tables, curves = predictions(simulators(), poses)
-    parts = {"tables": tables, "agree": agreements(curves), "rocking": rocking_table(poses, MUS)}
+    parts = {
+        "tables": tables,
+        "agree": agreements(curves),
+        "rocking": rocking_table(poses, MUS),
+    }
     parts["edges"] = edges()
     text = {name: "\n".join(lines) for name, lines in parts.items()}
     theory = {

@@ -29,7 +29,9 @@ class Setting(NamedTuple):
     free: dict
     values: dict[str, float]
     before: Callable[[np.random.Generator, int], np.ndarray]
-    uncertain: tuple[float, ...]  # 1 of velocities before that have errors, 0 of exact ones
+    uncertain: tuple[
+        float, ...
+    ]  # 1 of velocities before that have errors, 0 of exact ones
 
 
 def wall(rng: np.random.Generator, shots: int) -> np.ndarray:
@@ -106,7 +108,9 @@ def simulated(
     setting: Setting, shots: int, size: float, sets: int, rng: np.random.Generator
 ) -> list[ji.Experiments]:
     """Sets of shots with normally distributed errors of all velocities, before and after."""
-    after_all = jax.jit(jax.vmap(lambda v: ji.impact(setting.truth, setting.scene, v).velocity))
+    after_all = jax.jit(
+        jax.vmap(lambda v: ji.impact(setting.truth, setting.scene, v).velocity)
+    )
     sigma = size * TYPICAL
     data = []
     for _ in range(sets):
@@ -115,7 +119,9 @@ def simulated(
         sigma_pre = sigma * np.tile(setting.uncertain, (shots, 1))
         before_measured = before + sigma_pre * rng.normal(size=before.shape)
         after_measured = after + sigma * rng.normal(size=after.shape)
-        shot = ji.Experiments(before_measured, after_measured, sigma=sigma, sigma_pre=sigma_pre)
+        shot = ji.Experiments(
+            before_measured, after_measured, sigma=sigma, sigma_pre=sigma_pre
+        )
         data.append(shot)
     return data
 
@@ -132,7 +138,10 @@ def row(setting: Setting, shots: int, size: float, sets: int) -> list[float]:
         ends = np.array([fit.confidence_interval()[i] for fit in fits])
         inside = np.mean((ends[:, 0] <= true) & (true <= ends[:, 1]))
         error = value.std(ddof=1)
-        numbers += [(value.mean() - true) / (error / np.sqrt(sets)), (value.mean() - true) / error]
+        numbers += [
+            (value.mean() - true) / (error / np.sqrt(sets)),
+            (value.mean() - true) / error,
+        ]
         numbers.append(inside)
     squares = np.array([fit.chi_squared for fit in fits])
     freedom = fits[0].degrees_of_freedom
@@ -145,7 +154,9 @@ def main(sets: int) -> None:
     print(
         "scene, shots, sigma / v: for each parameter bias over its error, over the scatter of one"
     )
-    print("fit, coverage; then chi^2 per degree of freedom, and its distance from 1 in errors")
+    print(
+        "fit, coverage; then chi^2 per degree of freedom, and its distance from 1 in errors"
+    )
     for setting in SETTINGS:
         print(f"{setting.name}: {', '.join(setting.values)}")
         for shots in SHOTS:

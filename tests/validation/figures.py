@@ -57,11 +57,19 @@ def planar_friction() -> None:
     normals, tangents = rng.normal(size=(2, n, 3, 2))
     overlap = np.einsum("nim,nim->nm", normals, tangents / mass[..., None])
     square = np.einsum("nim,nim->nm", normals, normals / mass[..., None])
-    tangents -= normals * (overlap / square)[:, None]  # at right angles in the metric of M^-1
+    tangents -= (
+        normals * (overlap / square)[:, None]
+    )  # at right angles in the metric of M^-1
     length = np.einsum("nim,nim->nm", tangents, tangents / mass[..., None])
     tangents *= np.sqrt(square / length)[:, None]
-    v, e, mu = rng.normal(size=(n, 3)), rng.uniform(0, 1, (n, 2)), rng.uniform(0, 3, (n, 2))
-    v *= np.where(np.einsum("nim,ni->nm", normals, v).min(axis=1) < 0, 1.0, -1.0)[:, None]
+    v, e, mu = (
+        rng.normal(size=(n, 3)),
+        rng.uniform(0, 1, (n, 2)),
+        rng.uniform(0, 3, (n, 2)),
+    )
+    v *= np.where(np.einsum("nim,ni->nm", normals, v).min(axis=1) < 0, 1.0, -1.0)[
+        :, None
+    ]
 
     def impacts(rtol):
         def one(mass, normals, tangents, v, e, mu):
@@ -73,10 +81,13 @@ def planar_friction() -> None:
     found, exact = impacts(RTOL), impacts(FINEST)
     names = [ji.STATUS[int(s)].name for s in found.status]
     ended = np.array([name in ("ok", "plastic_limit") for name in names])
-    ended &= np.array([ji.STATUS[int(s)].name in ("ok", "plastic_limit") for s in exact.status])
+    ended &= np.array(
+        [ji.STATUS[int(s)].name in ("ok", "plastic_limit") for s in exact.status]
+    )
     error = relative(found, exact, v)[ended] / RTOL
     print(
-        f"{names.count('max_steps')} of {n} scenes: max_steps; errors of others over rtol: ", end=""
+        f"{names.count('max_steps')} of {n} scenes: max_steps; errors of others over rtol: ",
+        end="",
     )
     print(f"99 % below {np.quantile(error, 0.99):.1f}, the largest {error.max():.1f}")
 
@@ -84,10 +95,16 @@ def planar_friction() -> None:
 def stacked_balls() -> None:
     """motions_reference.md: a tennis ball on a basketball, with a gap and without."""
     mass, height, g = [0.6, 0.06], 1.0, 9.81
-    laws = {"Newton": ji.Newton(0.9), "Moreau": ji.Moreau(0.9), "Poisson": ji.Poisson(0.9)}
+    laws = {
+        "Newton": ji.Newton(0.9),
+        "Moreau": ji.Moreau(0.9),
+        "Poisson": ji.Poisson(0.9),
+    }
     laws |= {"LZB": ji.LZB(0.9, [1.0, 1.0]), "Binary": ji.Binary(0.9)}
     system = ji.System(
-        lambda q: jnp.stack([q[0], q[1] - q[0]]), mass, potential=ji.gravity(jnp.asarray(mass), g)
+        lambda q: jnp.stack([q[0], q[1] - q[0]]),
+        mass,
+        potential=ji.gravity(jnp.asarray(mass), g),
     )
     for gap in (0.0, 1e-6, 1e-3, 1e-2):
         after = {}
@@ -97,7 +114,10 @@ def stacked_balls() -> None:
             last = motion.event_times("impact")[-1]
             speed = motion.velocity[-1, 1] + g * (end - last)
             after[name] = float(speed / np.sqrt(2 * g * height))
-        print(f"gap {gap:.0e} m:", ", ".join(f"{name} {v:.4f}" for name, v in after.items()))
+        print(
+            f"gap {gap:.0e} m:",
+            ", ".join(f"{name} {v:.4f}" for name, v in after.items()),
+        )
 
 
 def accumulations() -> None:
@@ -112,8 +132,12 @@ def accumulations() -> None:
             motion = ji.simulate(system, law, q, [0.0] * 3, 3.0, method=method)
             last = int(motion.events.count) - 1
             time = float(motion.events.time[last])
-            end = float(np.nanmax(np.asarray(motion.events.accumulation_end)[: last + 1]))
-            print(f"{name}, slow {slow:.0e}: {last + 1} events, {time:.4f} to {end:.4f} s")
+            end = float(
+                np.nanmax(np.asarray(motion.events.accumulation_end)[: last + 1])
+            )
+            print(
+                f"{name}, slow {slow:.0e}: {last + 1} events, {time:.4f} to {end:.4f} s"
+            )
 
 
 def peak(time: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
@@ -124,7 +148,9 @@ def peak(time: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
     height = top - 0.25 * (before - after) * shift
     above = np.flatnonzero(force >= height / 2)
     first, last = above[0], above[-1]
-    start = np.interp(height / 2, force[first - 1 : first + 1], time[first - 1 : first + 1])
+    start = np.interp(
+        height / 2, force[first - 1 : first + 1], time[first - 1 : first + 1]
+    )
     end = np.interp(-height / 2, -force[last : last + 2], time[last : last + 2])
     return time[i] + shift * (time[1] - time[0]), height, end - start
 
@@ -132,23 +158,34 @@ def peak(time: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
 def solitary_wave() -> None:
     """waves.md: sixty balls of 1 kg with k = 1, struck at 1 m/s."""
     n = 60
-    h = ji.history(ji.LZB(1.0, np.ones(n - 1)), ji.chain(np.ones(n)), np.eye(n)[0], samples=1500)
+    h = ji.history(
+        ji.LZB(1.0, np.ones(n - 1)), ji.chain(np.ones(n)), np.eye(n)[0], samples=1500
+    )
     time, v = np.asarray(h.time), np.asarray(h.velocity)
-    arrival, height, duration = np.transpose([peak(time, f) for f in np.asarray(h.force).T])
+    arrival, height, duration = np.transpose(
+        [peak(time, f) for f in np.asarray(h.force).T]
+    )
     i = int(v[:, 31].argmax())
     top, low, high = v[i, 31], v[i - 1, 31], v[i + 1, 31]
     fastest = top + (low - high) ** 2 / (16 * top - 8 * (low + high))  # of a parabola
     limit = float(ji.theory.nesterenko_speed(1.0, 1.0, fastest))
     print(f"fastest {fastest:.5f} m/s, Nesterenko's speed {limit:.5f} contacts/s")
-    whole = np.pi / (2 * np.arccos(0.5 ** (1 / 6)))  # a pulse cos^6 over its time above half
+    whole = np.pi / (
+        2 * np.arccos(0.5 ** (1 / 6))
+    )  # a pulse cos^6 over its time above half
     for contact in (11, 21, 31, 41):
         j = contact - 1
         speed = 2 / (arrival[j + 1] - arrival[j - 1])
         width = whole * duration[j] * speed
-        print(f"contact {contact}: {speed:.5f} contacts/s, {speed / limit - 1:+.1%}, ", end="")
+        print(
+            f"contact {contact}: {speed:.5f} contacts/s, {speed / limit - 1:+.1%}, ",
+            end="",
+        )
         print(f"width {width:.3f} contacts, force {height[j]:.5f}")
     energy = v[i] ** 2
-    print(f"outside five balls {1 - energy[29:34].sum() / energy[20:45].sum():.0e} of the energy")
+    print(
+        f"outside five balls {1 - energy[29:34].sum() / energy[20:45].sum():.0e} of the energy"
+    )
 
 
 def correlated() -> None:
@@ -161,12 +198,21 @@ def correlated() -> None:
     print(ratios, lzb, sep="\n")
     for v in ([1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, -0.5]):
         a, b = (np.asarray(ji.impact(law, balls, v).velocity) for law in (ratios, lzb))
-        print(v, f"differ by {np.linalg.norm(a - b) / np.linalg.norm(v):.3f} of the speed")
+        print(
+            v, f"differ by {np.linalg.norm(a - b) / np.linalg.norm(v):.3f} of the speed"
+        )
 
 
 FIGURES: dict[str, Callable[[], None]] = {
     made.__name__: made
-    for made in (chains, planar_friction, stacked_balls, accumulations, solitary_wave, correlated)
+    for made in (
+        chains,
+        planar_friction,
+        stacked_balls,
+        accumulations,
+        solitary_wave,
+        correlated,
+    )
 }
 
 if __name__ == "__main__":

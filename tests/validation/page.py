@@ -45,5 +45,7 @@ if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parent))
     import rows as numbers
 
-    PAGE.write_text(page([(case, case.rows()) for case in numbers.CASES]), encoding="utf-8")
+    PAGE.write_text(
+        page([(case, case.rows()) for case in numbers.CASES]), encoding="utf-8"
+    )
     print(f"written: {PAGE}")

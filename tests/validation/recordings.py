@@ -38,7 +38,9 @@ def ball(rng: np.random.Generator, fps: float = 120, noise: float = 1e-3) -> Rec
     y = np.where(since < 0, -FALL * since, 0.8 * FALL * since) - G * since**2 / 2
     q = (y + noise * rng.normal(size=t.size))[:, None]
     options = {"acceleration": -G}
-    return Recording(t, q, options, np.array([first]), *np.array([[[-FALL]], [[0.8 * FALL]]]))
+    return Recording(
+        t, q, options, np.array([first]), *np.array([[[-FALL]], [[0.8 * FALL]]])
+    )
 
 
 # ------------------------------------------------------------------------------- bends and waves
@@ -53,7 +55,11 @@ def lens(rng: np.random.Generator, q: np.ndarray, size: float) -> np.ndarray:
 
 
 def gliders(
-    rng: np.random.Generator, fps: float, noise: float, slope: float = 0.0, waves: float = 0.0
+    rng: np.random.Generator,
+    fps: float,
+    noise: float,
+    slope: float = 0.0,
+    waves: float = 0.0,
 ) -> Recording:
     """Two gliders of .2 and .3 kg, 2.4 s; a table with a slope [m/s^2], and waves of a lens [m]."""
     at, masses = 1.2 + 0.1 * rng.random(), np.array([0.2, 0.3])
@@ -108,7 +114,9 @@ def exact(rng: np.random.Generator) -> Recording:
     one = ball(rng)
     q = np.column_stack([0.1 + 0.3 * one.t, one.q[:, 0]])
     before, after = (np.column_stack([[0.3], v]) for v in (one.before, one.after))
-    return one._replace(q=q, options={"acceleration": [0, -G]}, before=before, after=after)
+    return one._replace(
+        q=q, options={"acceleration": [0, -G]}, before=before, after=after
+    )
 
 
 def rounded(rng: np.random.Generator, pixel: float) -> Recording:
@@ -122,7 +130,10 @@ def rounded(rng: np.random.Generator, pixel: float) -> Recording:
 
 def spinning(rng: np.random.Generator, known: bool) -> Recording:
     """A table-tennis ball with drag and side spin that bounces once, 150 frames a second."""
-    drag, magnus = 0.12, 0.004 * np.array([0.0, rng.uniform(50, 150), 0.0])  # [1/m], [1/s]
+    drag, magnus = (
+        0.12,
+        0.004 * np.array([0.0, rng.uniform(50, 150), 0.0]),
+    )  # [1/m], [1/s]
 
     def air(v: np.ndarray) -> np.ndarray:
         """Acceleration by velocity."""
@@ -169,7 +180,9 @@ SETTINGS: dict[str, Callable[[np.random.Generator], Recording]] = {
     "the same, lens of .15 mm": lambda rng: gliders(rng, 500, 2e-5, waves=1.5e-4),
     "the same, lens of .3 mm": lambda rng: gliders(rng, 500, 2e-5, waves=3e-4),
     "the same, both": lambda rng: gliders(rng, 500, 2e-5, slope=0.02, waves=1.5e-4),
-    "pupils' gliders, 25 Hz, 1 mm, not level": lambda rng: gliders(rng, 25, 1e-3, slope=0.02),
+    "pupils' gliders, 25 Hz, 1 mm, not level": lambda rng: gliders(
+        rng, 25, 1e-3, slope=0.02
+    ),
     "6 frames lost at the impact": lambda rng: hidden(rng, 6),
     "12 frames lost": lambda rng: hidden(rng, 12),
     "20 frames lost": lambda rng: hidden(rng, 20),
@@ -218,12 +231,18 @@ def counted(one: Recording) -> Count:
     others = [impact for k, impact in enumerate(track.impacts) if k not in taken]
     doubtful = sum(impact.doubtful for impact in others)
     lost = len(one.instants) - len(taken)
-    return Count(len(taken), lost, len(others) - doubtful, doubtful, z, bool(track.warnings))
+    return Count(
+        len(taken), lost, len(others) - doubtful, doubtful, z, bool(track.warnings)
+    )
 
 
 def row(name: str, count: int) -> str:
     """A line of the table."""
-    rng, made, begun = np.random.default_rng(len(name)), SETTINGS[name], time.process_time()
+    rng, made, begun = (
+        np.random.default_rng(len(name)),
+        SETTINGS[name],
+        time.process_time(),
+    )
     counts = [counted(made(rng)) for _ in range(count)]
     took = (time.process_time() - begun) / count
     z = np.array([x for each in counts for x in each.z])
@@ -242,7 +261,17 @@ def row(name: str, count: int) -> str:
 def main(count: int) -> None:
     """Print the table."""
     print(f"{count} tracks a setting; false: not doubtful; errors in the stated ones")
-    heads = ("found", "lost", "false", "doubtful", "bias", "scatter", "within 95 %", "told", "ms")
+    heads = (
+        "found",
+        "lost",
+        "false",
+        "doubtful",
+        "bias",
+        "scatter",
+        "within 95 %",
+        "told",
+        "ms",
+    )
     print(f"| recording | {' | '.join(heads)} |")
     print(f"|{'---|' * (len(heads) + 1)}")
     for name in SETTINGS:

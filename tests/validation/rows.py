@@ -64,7 +64,9 @@ def galperin():
         # n reflections alternately at lines of angle a and 0, in (sqrt(M) v2, v1)
         a = np.arctan(1 / np.sqrt(mass))
         angle = np.pi - n * a if n % 2 == 0 else (n + 1) * a - np.pi
-        rows.append(Row(f"v2+, M = {number(mass)}", np.cos(angle), float(v[1]), 1e-9, 9))
+        rows.append(
+            Row(f"v2+, M = {number(mass)}", np.cos(angle), float(v[1]), 1e-9, 9)
+        )
     return rows
 
 
@@ -72,7 +74,9 @@ def inelastic_collapse():
     """Three equal balls: the largest e with endless collisions, by bisection."""
     balls, v = ji.chain([1.0, 1.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
     endless = jax.jit(
-        jax.vmap(lambda e: ji.impact(ji.Binary(e), balls, v).status == CODE["plastic_limit"])
+        jax.vmap(
+            lambda e: ji.impact(ji.Binary(e), balls, v).status == CODE["plastic_limit"]
+        )
     )
     low, high = 0.05, 0.1
     for _ in range(5):
@@ -93,15 +97,19 @@ def tapered_chain():
     for i, (n, q) in enumerate(known):  # further balls are long gone
         masses[i, :n] = (1 - q) ** (3 * np.arange(n))
         start[i, :n] = np.eye(n)[0]
-    after = jax.jit(jax.vmap(lambda m, v: ji.impact(ji.Binary(1.0), ji.chain(m), v).velocity))(
-        masses, start
-    )
+    after = jax.jit(
+        jax.vmap(lambda m, v: ji.impact(ji.Binary(1.0), ji.chain(m), v).velocity)
+    )(masses, start)
     rows = []
     for i, ((n, q), speed) in enumerate(known.items()):
         last, a = float(after[i, n - 1]), (1 - q) ** 3
         energy = (4 * a / (1 + a) ** 2) ** (n - 1)
         rows.append(Row(f"v_N, N = {n}, q = {q:g}", speed, last, 2e-9))
-        rows.append(Row(f"energy, N = {n}, q = {q:g}", energy, masses[i, n - 1] * last**2, 1e-12))
+        rows.append(
+            Row(
+                f"energy, N = {n}, q = {q:g}", energy, masses[i, n - 1] * last**2, 1e-12
+            )
+        )
     return rows
 
 
@@ -114,7 +122,9 @@ def at_a_wall(force, values, speed=1.0):
     @jax.jit
     @jax.vmap
     def restitution(x):
-        out = ji.impact(ji.Compliant(force(x), rtol=1e-11), ji.chain([1.0], wall=True), [speed])
+        out = ji.impact(
+            ji.Compliant(force(x), rtol=1e-11), ji.chain([1.0], wall=True), [speed]
+        )
         return -out.velocity[0] / speed
 
     return np.asarray(restitution(jnp.asarray(values, float)))
@@ -137,7 +147,12 @@ def hunt_crossley():
     for d, x in zip(known, e):
         left = d * v * (1 + x)
         rows.append(
-            Row(f"ln(...), d = {d:g}", left, float(np.log((1 + d * v) / (1 - d * x * v))), 1e-7)
+            Row(
+                f"ln(...), d = {d:g}",
+                left,
+                float(np.log((1 + d * v) / (1 - d * x * v))),
+                1e-7,
+            )
         )
     return rows
 
@@ -158,8 +173,15 @@ def hertz_spheres():
     deepest = (1.25 * m * v**2 / k) ** 0.4
     h = ji.history(ji.LZB(1.0, k, 1.5), ji.chain([1.0, 3.0]), [v, 0.0])
     return [
-        Row("duration v / delta_max", 2.94328, float(h.duration) * v / deepest, 2e-6, 5),
-        Row("F_max / (k delta_max^1.5)", 1.0, float(h.maximum_force[0]) / (k * deepest**1.5), 1e-7),
+        Row(
+            "duration v / delta_max", 2.94328, float(h.duration) * v / deepest, 2e-6, 5
+        ),
+        Row(
+            "F_max / (k delta_max^1.5)",
+            1.0,
+            float(h.maximum_force[0]) / (k * deepest**1.5),
+            1e-7,
+        ),
         Row("delta_max", deepest, float((h.maximum_force[0] / k) ** (2 / 3)), 1e-7),
     ]
 
@@ -167,12 +189,16 @@ def hertz_spheres():
 def oblique_sphere():
     """A homogeneous sphere on a plate, unit speed, angle theta from the normal."""
     e, mu = 0.98, 0.092
-    scene = ji.Scene([1.0, 1.0, 0.4], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [1.0]])
+    scene = ji.Scene(
+        [1.0, 1.0, 0.4], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [1.0]]
+    )
     degrees = np.array([5.0, 20.0, 30.0, 32.0, 33.0, 45.0, 70.0, 85.0])
     theta = np.radians(degrees)
     v = np.stack([np.sin(theta), -np.cos(theta), 0 * theta], axis=1)
     law = ji.Newton(e, friction=mu)
-    after = np.asarray(jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).velocity))(v))
+    after = np.asarray(
+        jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).velocity))(v)
+    )
     rolls = np.tan(theta) < 3.5 * mu * (1 + e)
     expected = np.where(rolls, 5 / 7 * v[:, 0], v[:, 0] + mu * (1 + e) * v[:, 1])
     return [
@@ -188,7 +214,9 @@ BALLS, TIME = 24, 12.0
 
 def waves(eta):
     """Time and velocities (samples, balls) of a chain struck at its end; k = m = 1."""
-    law = ji.LZB(jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(float(eta)), jnp.asarray(0.0))
+    law = ji.LZB(
+        jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(float(eta)), jnp.asarray(0.0)
+    )
     v = jnp.eye(BALLS)[0]
     h = ji.history(law, ji.chain(jnp.ones(BALLS)), v, samples=4001)
     return np.asarray(h.time), np.asarray(h.velocity), np.asarray(h.force)
@@ -204,7 +232,15 @@ def solitary_wave():
         return time[i] - b / (2 * a), c - b * b / (4 * a)
 
     (first, _), (_, largest), (last, _) = peak(11), peak(14), peak(17)
-    return [Row("c / ((k/m)^.4 v_max^.2)", 0.9146, 6 / (last - first) / largest**0.2, 0.009, 4)]
+    return [
+        Row(
+            "c / ((k/m)^.4 v_max^.2)",
+            0.9146,
+            6 / (last - first) / largest**0.2,
+            0.009,
+            4,
+        )
+    ]
 
 
 def schroedinger():
@@ -254,7 +290,9 @@ def rimless_wheel():
         tangents = np.stack([[1.0, 0.0, -y] for _, y in feet], axis=1)
         rate = -1.0  # clockwise about the rear foot
         v = rate * np.array([feet[0, 1], -feet[0, 0], 1.0])
-        ratio = float(rough(np.array([1.0, 1.0, inertia]), normals, tangents, v)[2]) / rate
+        ratio = (
+            float(rough(np.array([1.0, 1.0, inertia]), normals, tangents, v)[2]) / rate
+        )
         known = (np.cos(2 * np.pi / n) + inertia) / (1 + inertia)
         rows.append(Row(f"ratio, {n} spokes, r^2 = {inertia:g}", known, ratio, 1e-12))
     return rows
@@ -280,13 +318,19 @@ def bouncing_ball():
     rows = []
     for i in (0, 1, 5, 15):
         known = first * (1 + 2 * sum(e**j for j in range(1, i + 1)))
-        rows.append(Row(f"time of bounce {i + 1} [s]", known, float(times[i]), 1e-11, 10))
+        rows.append(
+            Row(f"time of bounce {i + 1} [s]", known, float(times[i]), 1e-11, 10)
+        )
     for i in (0, 4):
         top = 0.5 * float(motion.events.velocity_after[i, 0]) ** 2 / G
-        rows.append(Row(f"height after bounce {i + 1} [m]", e ** (2 * i + 2), top, 1e-10, 10))
+        rows.append(
+            Row(f"height after bounce {i + 1} [m]", e ** (2 * i + 2), top, 1e-10, 10)
+        )
     last = int(motion.events.count) - 1
     end = float(motion.events.accumulation_end[last])
-    rows.append(Row("end of the accumulation [s]", first * (1 + e) / (1 - e), end, 1e-10, 10))
+    rows.append(
+        Row("end of the accumulation [s]", first * (1 + e) / (1 - e), end, 1e-10, 10)
+    )
     return rows
 
 

@@ -41,7 +41,9 @@ class Row:
     spoiled: Callable[[np.ndarray], np.ndarray] = lambda post: post
     swapped: bool = False
     loss: str = "squares"
-    prior: float = 0.0  # standard deviation of what is known of the first parameter; 0: nothing
+    prior: float = (
+        0.0  # standard deviation of what is known of the first parameter; 0: nothing
+    )
     off: float = 0.0  # how many of these that knowledge is wrong by
     ends: bool = False  # every other shot comes from the other end
     expected: str = ""  # the warning that should come
@@ -49,7 +51,9 @@ class Row:
     def data(self, count):
         """So many data sets."""
         rng, n = np.random.default_rng(zlib.crc32(self.what.encode())), self.scene.size
-        impact = jax.jit(jax.vmap(lambda v: ji.impact(self.truth, self.scene, v).velocity))
+        impact = jax.jit(
+            jax.vmap(lambda v: ji.impact(self.truth, self.scene, v).velocity)
+        )
         pre = rng.uniform(-0.3, 0.3, (count, self.shots, n))
         pre[..., 0] = rng.uniform(0.5, 1.5, (count, self.shots))
         if self.scene is not WALLED:
@@ -62,7 +66,9 @@ class Row:
         post = exact + self.noise * rng.normal(size=exact.shape)
         pairs = [(a, self.spoiled(b)) for a, b in zip(pre, post)]
         pairs = [(b, a) for a, b in pairs] if self.swapped else pairs
-        return [ji.Experiments(a, b, self.noise if self.sigma else None) for a, b in pairs]
+        return [
+            ji.Experiments(a, b, self.noise if self.sigma else None) for a, b in pairs
+        ]
 
 
 def misread(post):
@@ -195,7 +201,10 @@ def covered(row, fits):
     """
     truth = truth_of(row, fits[0].names)
     linear = np.array(
-        [[any(a <= x <= b for a, b in p) for x, p in zip(truth, f.intervals())] for f in fits]
+        [
+            [any(a <= x <= b for a, b in p) for x, p in zip(truth, f.intervals())]
+            for f in fits
+        ]
     )
     if row.loss != "squares":  # has no profiles
         return linear.mean(axis=0), []
@@ -205,7 +214,9 @@ def covered(row, fits):
         y = best.copy()
         y[:, i] = [f.problem.variables.point(truth)[i] for f in fits]
         fixed = np.broadcast_to(np.arange(y.shape[1]) == i, y.shape)
-        squares = minimize([p.least_squares() for p in problems], y, Solver(), fixed=fixed).squares
+        squares = minimize(
+            [p.least_squares() for p in problems], y, Solver(), fixed=fixed
+        ).squares
         more = squares - [f.starts[0].sum_of_squares for f in fits]
         inside.append(more <= [(f.quantile(0.95) * f.noise) ** 2 for f in fits])
     return linear.mean(axis=0), np.mean(inside, axis=1)
@@ -229,7 +240,10 @@ def fitted(row, count):
         return with_priors(row, count)
     if row.loss != "squares":
         options = {"search": ji.Search(loss=row.loss), "starts": 1, "profiles": False}
-        return [ji.fit(row.law, row.scene, data, row.free, **options) for data in row.data(count)]
+        return [
+            ji.fit(row.law, row.scene, data, row.free, **options)
+            for data in row.data(count)
+        ]
     return ji.fit_many(row.law, row.scene, row.data(count), row.free)
 
 
@@ -258,7 +272,9 @@ def page(count, honest=HONEST, spoiled=SPOILED, ratios=(8.0, 40.0), print=print)
         fits = fitted(row, count)
         linear, profiled = covered(row, fits)
         first.append(f"| {row.what} | {percent(linear)} | {percent(profiled)} |")
-        second.append(f"| {row.what} | {' | '.join(percent(x) for x in alarms(fits).values())} |")
+        second.append(
+            f"| {row.what} | {' | '.join(percent(x) for x in alarms(fits).values())} |"
+        )
         print(first[-1], second[-1])
     third = ["| simulated | warning | how often |", "|---|---|---|"]
     for row in spoiled:

@@ -34,7 +34,9 @@ def height(t: np.ndarray) -> np.ndarray:
     return np.where(since < 0, -SPEED * since, E * SPEED * since) - G * since**2 / 2
 
 
-def ball(rng: np.random.Generator, fps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def ball(
+    rng: np.random.Generator, fps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, heights with noise, times since the bounce."""
     t = frames(rng, fps)
     return t, height(t) + NOISE * rng.normal(size=t.size), t - FIRST
@@ -47,7 +49,9 @@ def least_error(since: np.ndarray) -> float:
     """The bound, by the information on place, both velocities and the instant."""
     after = since >= 0
     velocity = np.where(after, E * SPEED, -SPEED) - G * since
-    slopes = np.stack([np.ones_like(since), since * ~after, since * after, -velocity], axis=1)
+    slopes = np.stack(
+        [np.ones_like(since), since * ~after, since * after, -velocity], axis=1
+    )
     covariance = np.linalg.inv(slopes.T @ slopes) * NOISE**2
     gradient = np.array([0.0, E / SPEED, 1 / SPEED, 0.0])
     return float(np.sqrt(gradient @ covariance @ gradient))
@@ -59,7 +63,9 @@ def restitution(impact: ji.tracks.TrackImpact, c: int = -1) -> tuple[float, floa
     pre, post = impact.pre[c], impact.post[c]
     slope = np.zeros((2, n))
     slope[:, c] = post / pre**2, -1 / pre
-    return -post / pre, float(np.sqrt(slope.ravel() @ impact.covariance @ slope.ravel()))
+    return -post / pre, float(
+        np.sqrt(slope.ravel() @ impact.covariance @ slope.ravel())
+    )
 
 
 def row(fps: int) -> str:
@@ -73,7 +79,9 @@ def row(fps: int) -> str:
             values.append((*restitution(track.impacts[0]), least_error(since)))
     e, stated, least = np.array(values).T
     within = np.mean(np.abs(e - E) < 1.96 * stated)
-    print(f"{fps} frames a second: {len(e)} of {TRACKS} with one impact, {warned} with a warning")
+    print(
+        f"{fps} frames a second: {len(e)} of {TRACKS} with one impact, {warned} with a warning"
+    )
     return (
         f"| {fps} | {e.mean() - E:.5f} | {e.std():.5f} | {stated.mean():.5f} | {least.mean():.5f} "
         f"| {100 * within:.1f} % |"
@@ -90,7 +98,11 @@ def in_space() -> str:
         q[rng.random(len(t)) < 0.1] = np.nan
         track = ji.tracks.find_impacts(t, q, acceleration=[0, 0, -G])
         found += len(track.impacts) == 1
-        values += [restitution(each)[0] for each in track.impacts if abs(each.time - FIRST) < NEAR]
+        values += [
+            restitution(each)[0]
+            for each in track.impacts
+            if abs(each.time - FIRST) < NEAR
+        ]
     e = np.array(values)
     return (
         f"in space, a tenth of the frames lost, noise unknown: {found} of {TRACKS} with one impact, "
@@ -122,7 +134,9 @@ def lines(t: np.ndarray, y: np.ndarray) -> float:
     """Straight lines through six frames on each side of the lowest one."""
     low = int(np.argmin(y))
     before, after = slice(low - 6, low), slice(low + 1, low + 7)
-    return float(-np.polyfit(t[after], y[after], 1)[0] / np.polyfit(t[before], y[before], 1)[0])
+    return float(
+        -np.polyfit(t[after], y[after], 1)[0] / np.polyfit(t[before], y[before], 1)[0]
+    )
 
 
 WAYS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
@@ -151,9 +165,15 @@ def dragged(t: np.ndarray, drag: float = 0.12) -> np.ndarray:
     rate = np.sqrt(G * drag)
     # down, with the speed SPEED at the bounce; up, until it turns, and down again
     arrived = np.arctanh(SPEED / terminal) / rate
-    before = np.log(np.cosh(rate * arrived) / np.cosh(rate * np.maximum(since + arrived, 0))) / drag
+    before = (
+        np.log(np.cosh(rate * arrived) / np.cosh(rate * np.maximum(since + arrived, 0)))
+        / drag
+    )
     rise = np.arctan(E * SPEED / terminal) / rate
-    up = np.log(np.cos(rate * np.clip(rise - since, 0, rise)) / np.cos(rate * rise)) / drag
+    up = (
+        np.log(np.cos(rate * np.clip(rise - since, 0, rise)) / np.cos(rate * rise))
+        / drag
+    )
     down = np.log(np.cosh(rate * np.maximum(since - rise, 0))) / drag
     return np.where(since < 0, before, up - down)
 
@@ -165,10 +185,14 @@ def trapped(name: str, rng: np.random.Generator) -> dict[str, object]:
     noise = NOISE * rng.normal(size=t.size)
     good: dict[str, object] = {"t": t, "q": y + noise, "acceleration": -G}
     taken = np.arange(len(t)) * 4 // 5  # every fifth frame is there twice
-    angle = np.where(t < FIRST, 8.0, -5.0) * (t - FIRST) + 0.005 * rng.normal(size=t.size)
+    angle = np.where(t < FIRST, 8.0, -5.0) * (t - FIRST) + 0.005 * rng.normal(
+        size=t.size
+    )
     changes: dict[str, dict[str, object]] = {
         "nothing": {},
-        "times jitter, .2 ms": {"q": height(t + 2e-4 * rng.normal(size=t.size)) + noise},
+        "times jitter, .2 ms": {
+            "q": height(t + 2e-4 * rng.normal(size=t.size)) + noise
+        },
         "times jitter, 1 ms": {"q": height(t + 1e-3 * rng.normal(size=t.size)) + noise},
         "rolling shutter, 5 ms a metre": {"q": height(t - 0.005 * y) + noise},
         "rolling shutter, 16 ms a metre": {"q": height(t - 0.016 * y) + noise},
@@ -180,20 +204,40 @@ def trapped(name: str, rng: np.random.Generator) -> dict[str, object]:
         "camera pans, 5 cm/s": {"q": y + 0.05 * t + noise},
         "camera shakes, 3 mm at 3 Hz": {"q": y + 0.003 * np.sin(6 * np.pi * t) + noise},
         "every fifth frame twice": {"q": (y + noise)[taken]},
-        "the same, noise added": {"q": (y + noise)[taken] + 1e-4 * rng.normal(size=t.size)},
+        "the same, noise added": {
+            "q": (y + noise)[taken] + 1e-4 * rng.normal(size=t.size)
+        },
         "y points down": {"q": -y + noise},
         "gravity forgotten": {"acceleration": 0.0},
-        "degrees for radians": {"q": np.degrees(angle), "acceleration": 0.0, "units": "rad"},
+        "degrees for radians": {
+            "q": np.degrees(angle),
+            "acceleration": 0.0,
+            "units": "rad",
+        },
     }
     return good | changes[name]
 
 
 TRAPS = (
-    *("nothing", "times jitter, .2 ms", "times jitter, 1 ms", "rolling shutter, 5 ms a metre"),
-    *("rolling shutter, 16 ms a metre", "lengths 2 % short", "the same, acceleration unknown"),
+    *(
+        "nothing",
+        "times jitter, .2 ms",
+        "times jitter, 1 ms",
+        "rolling shutter, 5 ms a metre",
+    ),
+    *(
+        "rolling shutter, 16 ms a metre",
+        "lengths 2 % short",
+        "the same, acceleration unknown",
+    ),
     *("drag of a table-tennis ball", "the same, drag known", "the same, drag unknown"),
     *("camera pans, 5 cm/s", "camera shakes, 3 mm at 3 Hz"),
-    *("every fifth frame twice", "the same, noise added", "y points down", "gravity forgotten"),
+    *(
+        "every fifth frame twice",
+        "the same, noise added",
+        "y points down",
+        "gravity forgotten",
+    ),
     "degrees for radians",
 )
 
@@ -223,7 +267,12 @@ def told(name: str) -> str:
 
 def seconds(count: int) -> str:
     """First and second call of a ball that bounces on, 120 frames a second."""
-    rng, t, start, y = np.random.default_rng(0), np.arange(count) / 120, 0.0, np.zeros(count)
+    rng, t, start, y = (
+        np.random.default_rng(0),
+        np.arange(count) / 120,
+        0.0,
+        np.zeros(count),
+    )
     while start < t[-1]:
         speed = 2 + 1.5 * rng.random()
         here = (t >= start) & (t < start + 2 * speed / G)
@@ -240,7 +289,11 @@ def seconds(count: int) -> str:
 
 # --------------------------------------------------------------------- measured drops of a square
 
-SQUARE_ERRORS = [2e-4, 2e-4, 4e-3]  # of a pose [m], [m], [rad]; it is stored in 20 um and .5 mrad
+SQUARE_ERRORS = [
+    2e-4,
+    2e-4,
+    4e-3,
+]  # of a pose [m], [m], [rad]; it is stored in 20 um and .5 mrad
 ROUNDED = 5e-3  # [m] by which corners of a perfect square would lie in the table
 
 
@@ -249,14 +302,24 @@ def gliders() -> str:
 
     The fit knows momentum, which the velocities must conserve.
     """
-    rng, (m1, m2), v, found, values = np.random.default_rng(3), (0.2, 0.3), (0.6, -0.2), 0, []
+    rng, (m1, m2), v, found, values = (
+        np.random.default_rng(3),
+        (0.2, 0.3),
+        (0.6, -0.2),
+        0,
+        [],
+    )
     jump = (1 + E) * (v[0] - v[1]) / (1 / m1 + 1 / m2)  # impulse [N s]
     after, scene = (v[0] - jump / m1, v[1] + jump / m2), ji.chain([m1, m2])
     for _ in range(TRACKS):
         t = (np.arange(72) + rng.random()) / 60
         since = t - 0.6
-        q = np.stack([np.where(since < 0, a, b) * since for a, b in zip(v, after)], axis=1)
-        track = ji.tracks.find_impacts(t, q + NOISE * rng.normal(size=q.shape), acceleration=0.0)
+        q = np.stack(
+            [np.where(since < 0, a, b) * since for a, b in zip(v, after)], axis=1
+        )
+        track = ji.tracks.find_impacts(
+            t, q + NOISE * rng.normal(size=q.shape), acceleration=0.0
+        )
         found += len(track.impacts) == 1
         if len(track.impacts) == 1:
             fit = ji.fit(ji.Newton(0.5), scene, track.experiments(), starts=1)
@@ -283,10 +346,18 @@ def cube() -> str:
         t = (np.arange(50) + rng.random()) / 148
         since, noise = (t - at)[:, None], sigma * rng.normal(size=(len(t), 6))
         v = np.where(since < 0, before, after)
-        places = pose[:3] + v[:, :3] * since - G / 2 * since**2 * [0, 0, 1] + noise[:, :3]
-        turns = turn * Rotation.from_rotvec(v[:, 3:] * since) * Rotation.from_rotvec(noise[:, 3:])
+        places = (
+            pose[:3] + v[:, :3] * since - G / 2 * since**2 * [0, 0, 1] + noise[:, :3]
+        )
+        turns = (
+            turn
+            * Rotation.from_rotvec(v[:, 3:] * since)
+            * Rotation.from_rotvec(noise[:, 3:])
+        )
         q = np.hstack([places, turns.as_quat()])
-        track = ji.tracks.find_impacts(t, q, sigma, acceleration=[0, 0, -G], quaternion="xyzw")
+        track = ji.tracks.find_impacts(
+            t, q, sigma, acceleration=[0, 0, -G], quaternion="xyzw"
+        )
         if len(track.impacts) == 1:
             (impact,) = track.impacts
             apart = np.concatenate([impact.pre - before, impact.post - after])

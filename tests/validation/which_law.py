@@ -34,7 +34,9 @@ def main():
             constant = ji.fit_many(ji.Newton(E), PAIR, data)
             full = ji.fit_many(falling, PAIR, data)
             needed = [ji.nested_test(a, b).needed for a, b in zip(constant, full)]
-            plain = np.mean([abs(x.value[0] - E) < STUDENT * x.standard_error[0] for x in constant])
+            plain = np.mean(
+                [abs(x.value[0] - E) < STUDENT * x.standard_error[0] for x in constant]
+            )
             print(
                 f"sigma {sigma}, exponent {exponent}, scatter {scatter}: exponent needed "
                 f"{np.mean(needed):.1%}; in 95 %: {plain:.1%} by the fit",

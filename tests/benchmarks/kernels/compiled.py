@@ -28,7 +28,9 @@ def compiler_version() -> str:
     """First line of `g++ --version`."""
     if shutil.which("g++") is None:
         return "no g++"
-    out = subprocess.run(["g++", "--version"], capture_output=True, text=True, check=True)
+    out = subprocess.run(
+        ["g++", "--version"], capture_output=True, text=True, check=True
+    )
     return out.stdout.splitlines()[0]
 
 
@@ -38,7 +40,16 @@ def build(source: str, target: str, flags: Sequence[str] = ()) -> Path | None:
         print(f"skipped: {source} needs g++")
         return None
     path = _folder() / target
-    command = ["g++", *FLAGS, "-I", str(_folder()), str(HERE / source), "-o", str(path), *flags]
+    command = [
+        "g++",
+        *FLAGS,
+        "-I",
+        str(_folder()),
+        str(HERE / source),
+        "-o",
+        str(path),
+        *flags,
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if "error" in line] or ["?"]
@@ -57,8 +68,15 @@ def _tableau() -> str:
     lines = [f"constexpr int STAGES = {stages};"]
     entries = ",\n    ".join(row(values) for values in DOP853.a)
     lines.append(f"constexpr double A[{stages}][{stages}] = {{\n    {entries}}};")
-    named = {"B": DOP853.b, "C": DOP853.c, "HIGH": DOP853.error_high, "LOW": DOP853.error_low}
-    lines += [f"constexpr double {name}[{stages}] = {row(v)};" for name, v in named.items()]
+    named = {
+        "B": DOP853.b,
+        "C": DOP853.c,
+        "HIGH": DOP853.error_high,
+        "LOW": DOP853.error_low,
+    }
+    lines += [
+        f"constexpr double {name}[{stages}] = {row(v)};" for name, v in named.items()
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -41,9 +41,15 @@ def _rk4(k1, k2, e1, e2, h):
     for _ in range(MOST):
         a1, a2, a3, a4 = _rates(x1, x2, g1, g2, k1, k2, e1, e2)
         s = 0.5 * h
-        b1, b2, b3, b4 = _rates(x1 + s * a1, x2 + s * a2, g1 + s * a3, g2 + s * a4, k1, k2, e1, e2)
-        c1, c2, c3, c4 = _rates(x1 + s * b1, x2 + s * b2, g1 + s * b3, g2 + s * b4, k1, k2, e1, e2)
-        d1, d2, d3, d4 = _rates(x1 + h * c1, x2 + h * c2, g1 + h * c3, g2 + h * c4, k1, k2, e1, e2)
+        b1, b2, b3, b4 = _rates(
+            x1 + s * a1, x2 + s * a2, g1 + s * a3, g2 + s * a4, k1, k2, e1, e2
+        )
+        c1, c2, c3, c4 = _rates(
+            x1 + s * b1, x2 + s * b2, g1 + s * b3, g2 + s * b4, k1, k2, e1, e2
+        )
+        d1, d2, d3, d4 = _rates(
+            x1 + h * c1, x2 + h * c2, g1 + h * c3, g2 + h * c4, k1, k2, e1, e2
+        )
         x1 = max(x1 + h / 6 * (a1 + 2.0 * (b1 + c1) + d1), 0.0)
         x2 = max(x2 + h / 6 * (a2 + 2.0 * (b2 + c2) + d2), 0.0)
         g1 += h / 6 * (a3 + 2.0 * (b3 + c3) + d3)
@@ -60,7 +66,10 @@ def _verlet(k1, k2, e1, e2, h):
     for _ in range(MOST):
         g1 += 0.5 * h * (2.0 * f1 - f2)
         g2 += 0.5 * h * (2.0 * f2 - f1)
-        x1, x2 = max(x1 + h * _rate(x1, g1, e1), 0.0), max(x2 + h * _rate(x2, g2, e2), 0.0)
+        x1, x2 = (
+            max(x1 + h * _rate(x1, g1, e1), 0.0),
+            max(x2 + h * _rate(x2, g2, e2), 0.0),
+        )
         f1, f2 = _force(k1, x1), _force(k2, x2)
         g1 += 0.5 * h * (2.0 * f1 - f2)
         g2 += 0.5 * h * (2.0 * f2 - f1)

@@ -20,7 +20,11 @@ def row(stiffness: np.ndarray, exact: np.ndarray, quick: bool) -> dict[str, Any]
         print("skipped: Siconos is not installed (Debian: libsiconos-kernel-dev)")
         return None
     # the work is done in the library: the driver need not be optimised
-    flags = ["-O0", *(f"-I{INCLUDE / sub}" for sub in ("", "kernel", "numerics")), *LIBRARIES]
+    flags = [
+        "-O0",
+        *(f"-I{INCLUDE / sub}" for sub in ("", "kernel", "numerics")),
+        *LIBRARIES,
+    ]
     path = compiled.build("siconos_three_balls.cpp", "siconos_three_balls", flags)
     if path is None:
         return None
@@ -31,7 +35,9 @@ def row(stiffness: np.ndarray, exact: np.ndarray, quick: bool) -> dict[str, Any]
         i = order[int(part * len(order))]
         command = [str(path), "0.9", repr(float(stiffness[i, 1])), repr(step)]
         out = subprocess.run(command, capture_output=True, text=True).stdout
-        lines = [line.split()[1:] for line in out.splitlines() if line.startswith("result")]
+        lines = [
+            line.split()[1:] for line in out.splitlines() if line.startswith("result")
+        ]
         if not lines:
             print("skipped: Siconos gave no result")
             return None

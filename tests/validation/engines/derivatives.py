@@ -48,7 +48,9 @@ def by_mjx(stiffness, step):
     def after(speed, radius):
         changed = there.replace(geom_size=there.geom_size.at[1].set(radius))
         state = start.replace(qvel=start.qvel.at[0].set(-speed))
-        kinds = jax.eval_shape(mjx.step, changed, state)  # in x64 the first step changes types
+        kinds = jax.eval_shape(
+            mjx.step, changed, state
+        )  # in x64 the first step changes types
         state = jax.tree.map(lambda x, kind: jnp.asarray(x, kind.dtype), state, kinds)
         run = jax.lax.scan(
             lambda x, _: (mjx.step(changed, x), None), state, length=round(END / step)
@@ -68,9 +70,13 @@ def by_diffrax(speed, radius):
     control |= {"adjoint": diffrax.ForwardMode()}
     start = jnp.stack([jnp.asarray(PLACE), -speed])
     solve = diffrax.diffeqsolve
-    down = solve(flight, diffrax.Tsit5(), 0.0, END, 1e-4, start, radius, event=event, **control)
+    down = solve(
+        flight, diffrax.Tsit5(), 0.0, END, 1e-4, start, radius, event=event, **control
+    )
     hit = down.ys[-1] * jnp.array([1.0, -1.0])
-    return solve(flight, diffrax.Tsit5(), down.ts[-1], END, 1e-4, hit, radius, **control).ys[-1, 1]
+    return solve(
+        flight, diffrax.Tsit5(), down.ts[-1], END, 1e-4, hit, radius, **control
+    ).ys[-1, 1]
 
 
 class Ground(eqx.Module):
@@ -93,7 +99,10 @@ def by_jimpact(speed, radius):
 def main():
     jax.config.update("jax_enable_x64", True)
     rows = {"closed form": closed_form}
-    own, other = f"MJX {version('mujoco-mjx')}", f"diffrax {version('diffrax')}, with an event"
+    own, other = (
+        f"MJX {version('mujoco-mjx')}",
+        f"diffrax {version('diffrax')}, with an event",
+    )
     rows |= {
         f"{own}, stiffness 1e5 1/s^2, step 2 ms": by_mjx("1e5", 2e-3),
         f"{own}, the same, step .2 ms": by_mjx("1e5", 2e-4),
@@ -112,7 +121,10 @@ def main():
             more, less = list(at), list(at)
             more[k], less[k] = more[k] + CHANGE, less[k] - CHANGE
             cells += [float(slopes[k]), float(run(*more) - run(*less)) / (2 * CHANGE)]
-        print(f"| {name} | " + " | ".join(f"{cell:.4f}" for cell in cells) + " |", flush=True)
+        print(
+            f"| {name} | " + " | ".join(f"{cell:.4f}" for cell in cells) + " |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ def after(masses, wall, restitution, pipeline, step):
     if wall:
         return None
     ball = '<body pos="{} 0 0"><freejoint/><geom type="sphere" size="{}" mass="{}"/></body>'
-    balls = "".join(ball.format(2 * RADIUS * k, RADIUS, m) for k, m in enumerate(masses))
+    balls = "".join(
+        ball.format(2 * RADIUS * k, RADIUS, m) for k, m in enumerate(masses)
+    )
     system = mjcf.loads(f"""
     <mujoco><option timestep="{step}" gravity="0 0 0"/>
     <default><geom friction="0 0 0"/></default>
@@ -28,7 +30,9 @@ def after(masses, wall, restitution, pipeline, step):
     run = PIPELINES[pipeline]
     speeds = jax.numpy.zeros(system.qd_size()).at[0].set(1.0)
     state = run.init(system, system.init_q, speeds)
-    one = jax.jit(lambda state: run.step(system, state, jax.numpy.zeros(system.act_size())))
+    one = jax.jit(
+        lambda state: run.step(system, state, jax.numpy.zeros(system.act_size()))
+    )
     for _ in range(round(TIME / step)):
         state = one(state)
     return state.xd.vel[:, 0]

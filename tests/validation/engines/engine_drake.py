@@ -26,7 +26,15 @@ TIME = 0.05  # [s]
 STIFFNESS = 1e6  # Drake's default [N/m]
 
 
-def after(masses, wall, restitution, step, dissipation=0.0, relaxation=0.0, stiffness=STIFFNESS):
+def after(
+    masses,
+    wall,
+    restitution,
+    step,
+    dissipation=0.0,
+    relaxation=0.0,
+    stiffness=STIFFNESS,
+):
     if restitution != 1:
         return None
     builder = DiagramBuilder()
@@ -44,12 +52,18 @@ def after(masses, wall, restitution, step, dissipation=0.0, relaxation=0.0, stif
 
     joints = []
     for k, mass in enumerate(masses):
-        ball = plant.AddRigidBody(f"b{k}", SpatialInertia.SolidSphereWithMass(mass, RADIUS))
+        ball = plant.AddRigidBody(
+            f"b{k}", SpatialInertia.SolidSphereWithMass(mass, RADIUS)
+        )
         solid(ball, RigidTransform(), Sphere(RADIUS), f"g{k}")
-        along = PrismaticJoint(f"x{k}", plant.world_frame(), ball.body_frame(), [1, 0, 0])
+        along = PrismaticJoint(
+            f"x{k}", plant.world_frame(), ball.body_frame(), [1, 0, 0]
+        )
         joints.append(plant.AddJoint(along))
     if wall:
-        turn = RotationMatrix.MakeYRotation(-np.pi / 2)  # the half space's normal is its z axis
+        turn = RotationMatrix.MakeYRotation(
+            -np.pi / 2
+        )  # the half space's normal is its z axis
         pose = RigidTransform(turn, [RADIUS * (2 * len(masses) - 1), 0, 0])
         solid(plant.world_body(), pose, HalfSpace(), "wall")
     plant.Finalize()

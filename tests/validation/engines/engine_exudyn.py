@@ -25,7 +25,9 @@ def after(masses, wall, restitution, model, exponent, stiffness, step, gap=0.0):
         bodies.append(system.CreateMassPoint(mass=mass, **start))
     solids = list(bodies)
     if wall:
-        solids.append(system.CreateGround(referencePosition=[2 * RADIUS * len(masses), 0, 0]))
+        solids.append(
+            system.CreateGround(referencePosition=[2 * RADIUS * len(masses), 0, 0])
+        )
     for pair in itertools.pairwise(solids):
         system.CreateSphereSphereContact(
             itemNumbers=list(pair),
@@ -47,8 +49,18 @@ def after(masses, wall, restitution, model, exponent, stiffness, step, gap=0.0):
 
 
 if __name__ == "__main__":
-    hertz = {"model": 2, "exponent": 1.5, "stiffness": 1e7, "step": 1e-4}  # [N / m^1.5], [s]
-    linear = {"model": 0, "exponent": 1.0, "stiffness": 1e5, "step": 1e-4}  # [N / m], [s]
+    hertz = {
+        "model": 2,
+        "exponent": 1.5,
+        "stiffness": 1e7,
+        "step": 1e-4,
+    }  # [N / m^1.5], [s]
+    linear = {
+        "model": 0,
+        "exponent": 1.0,
+        "stiffness": 1e5,
+        "step": 1e-4,
+    }  # [N / m], [s]
     settings = {
         "contact model 2, Hertz, step .1 ms": hertz,
         "contact model 0, linear, step .1 ms": linear,

@@ -39,7 +39,9 @@ def after(masses, wall, restitution, contact, damping, step):
     """)
     for k, mass in enumerate(masses):
         engine.command(f"create_atoms 1 single {2 * RADIUS * k} 0 0 units box")
-        engine.command(f"set atom {k + 1} diameter {2 * RADIUS} density {DENSITY * mass}")
+        engine.command(
+            f"set atom {k + 1} diameter {2 * RADIUS} density {DENSITY * mass}"
+        )
     if wall:
         x = RADIUS * (2 * len(masses) - 1)
         engine.command(f"fix wall all wall/gran granular {pair} xplane NULL {x}")
@@ -56,9 +58,16 @@ def after(masses, wall, restitution, contact, damping, step):
 
 
 if __name__ == "__main__":
-    hertz, hooke = "hertz/material 1e8 {} .3", "hooke 1e7 {}"  # [Pa], e, Poisson; [N/m], e
+    hertz, hooke = (
+        "hertz/material 1e8 {} .3",
+        "hooke 1e7 {}",
+    )  # [Pa], e, Poisson; [N/m], e
     settings = {
-        f"{name}, {damping}, step {text}": {"contact": contact, "damping": damping, "step": step}
+        f"{name}, {damping}, step {text}": {
+            "contact": contact,
+            "damping": damping,
+            "step": step,
+        }
         for name, contact, damping, text, step in (
             ("hertz/material", hertz, "coeff_restitution", "10 us", 1e-5),
             ("hertz/material", hertz, "tsuji", "10 us", 1e-5),

@@ -14,12 +14,16 @@ from rows import RADIUS, TIME, print_rows
 def after(masses, wall, restitution, solref, solimp, step):
     if restitution != 1:
         return None
-    ball = (
-        '<body pos="{:g} 0 0"><joint type="slide" axis="1 0 0"/><geom size="{}" mass="{}"/></body>'
+    ball = '<body pos="{:g} 0 0"><joint type="slide" axis="1 0 0"/><geom size="{}" mass="{}"/></body>'
+    balls = "".join(
+        ball.format(2 * RADIUS * k, RADIUS, m) for k, m in enumerate(masses)
     )
-    balls = "".join(ball.format(2 * RADIUS * k, RADIUS, m) for k, m in enumerate(masses))
     x = RADIUS * (2 * len(masses) - 1)
-    plane = f'<geom type="plane" size="1 1 1" pos="{x} 0 0" zaxis="-1 0 0"/>' if wall else ""
+    plane = (
+        f'<geom type="plane" size="1 1 1" pos="{x} 0 0" zaxis="-1 0 0"/>'
+        if wall
+        else ""
+    )
     model = mujoco.MjModel.from_xml_string(f"""
     <mujoco><option timestep="{step}" gravity="0 0 0"/>
     <default><geom condim="1" solref="{solref}" solimp="{solimp}"/></default>

@@ -19,7 +19,9 @@ def after(masses, wall, restitution, step):
         builder.add_shape_sphere(body, radius=RADIUS, cfg=kind)
     if wall:
         x = RADIUS * (2 * len(masses) - 1)
-        builder.add_shape_plane(plane=(-1.0, 0.0, 0.0, x), width=0.0, length=0.0, cfg=kind)
+        builder.add_shape_plane(
+            plane=(-1.0, 0.0, 0.0, x), width=0.0, length=0.0, cfg=kind
+        )
     model = builder.finalize(device="cpu")
     solver = newton.solvers.SolverXPBD(model, enable_restitution=True)
     state, other, control = model.state(), model.state(), model.control()
@@ -36,4 +38,6 @@ def after(masses, wall, restitution, step):
 
 if __name__ == "__main__":
     wp.config.quiet = True
-    print_rows("newton-XPBD", newton.__version__, {"step 1/60 s": {"step": 1 / 60}}, after)
+    print_rows(
+        "newton-XPBD", newton.__version__, {"step 1/60 s": {"step": 1 / 60}}, after
+    )

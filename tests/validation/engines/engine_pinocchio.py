@@ -26,8 +26,12 @@ def after(masses, wall, restitution):
         rows = np.vstack([rows, -np.eye(n)[-1]])
     before = np.eye(n)[0]
     data = model.createData()
-    return pinocchio.impulseDynamics(model, data, np.zeros(n), before, rows, restitution, 0.0)
+    return pinocchio.impulseDynamics(
+        model, data, np.zeros(n), before, rows, restitution, 0.0
+    )
 
 
 if __name__ == "__main__":
-    print_rows("pinocchio", pinocchio.__version__, {"impulseDynamics, no damping": {}}, after)
+    print_rows(
+        "pinocchio", pinocchio.__version__, {"impulseDynamics, no damping": {}}, after
+    )

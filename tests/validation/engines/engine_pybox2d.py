@@ -22,7 +22,9 @@ def after(masses, wall, restitution, step, speed):
             friction=0.0,
             restitution=restitution,
         )
-        bodies.append(world.CreateDynamicBody(position=(2 * RADIUS * k, 0), fixtures=disc))
+        bodies.append(
+            world.CreateDynamicBody(position=(2 * RADIUS * k, 0), fixtures=disc)
+        )
     if wall:
         x = RADIUS * (2 * len(masses) - 1)
         edge = b2EdgeShape(vertices=[(x, -1), (x, 1)])
@@ -31,12 +33,15 @@ def after(masses, wall, restitution, step, speed):
         )
     bodies[0].linearVelocity = (speed, 0)
     for _ in range(round(TIME / step)):
-        world.Step(step, 8, 3)  # iterations of velocities and positions that its manual proposes
+        world.Step(
+            step, 8, 3
+        )  # iterations of velocities and positions that its manual proposes
     return [body.linearVelocity.x for body in bodies]
 
 
 if __name__ == "__main__":
     settings = {
-        f"step 1/60 s, {speed} m/s": {"step": 1 / 60, "speed": float(speed)} for speed in (10, 1)
+        f"step 1/60 s, {speed} m/s": {"step": 1 / 60, "speed": float(speed)}
+        for speed in (10, 1)
     }
     print_rows("pybox2d", version("box2d"), settings, after)

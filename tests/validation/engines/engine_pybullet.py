@@ -18,11 +18,15 @@ def after(masses, wall, restitution, step):
     ball = p.createCollisionShape(p.GEOM_SPHERE, radius=RADIUS)
     bodies = []
     for k, mass in enumerate(masses):
-        bodies.append(p.createMultiBody(mass, ball, basePosition=[2 * RADIUS * k, 0, 0]))
+        bodies.append(
+            p.createMultiBody(mass, ball, basePosition=[2 * RADIUS * k, 0, 0])
+        )
     solids = list(bodies)
     if wall:
         box = p.createCollisionShape(p.GEOM_BOX, halfExtents=[RADIUS, 1, 1])
-        solids.append(p.createMultiBody(0, box, basePosition=[2 * RADIUS * len(masses), 0, 0]))
+        solids.append(
+            p.createMultiBody(0, box, basePosition=[2 * RADIUS * len(masses), 0, 0])
+        )
     for body in solids:
         free = {"linearDamping": 0, "angularDamping": 0, "lateralFriction": 0}
         p.changeDynamics(body, -1, restitution=root_of_product(restitution), **free)

@@ -42,7 +42,10 @@ def after(masses, wall, restitution, threshold, step):
 
 if __name__ == "__main__":
     settings = {
-        f"TGS, bounce threshold {name} m/s, step 10 ms": {"threshold": value, "step": 0.01}
+        f"TGS, bounce threshold {name} m/s, step 10 ms": {
+            "threshold": value,
+            "step": 0.01,
+        }
         for name, value in ((".01", 0.01), ("2", 2.0))
     }
     print_rows("sapien", sapien.__version__, settings, after)

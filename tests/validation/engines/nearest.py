@@ -16,7 +16,9 @@ import numpy as np
 
 import jimpact as ji
 
-TABLE = Path(__file__).parents[3] / "jimpact" / "data" / "engine_impacts.csv"  # of this checkout
+TABLE = (
+    Path(__file__).parents[3] / "jimpact" / "data" / "engine_impacts.csv"
+)  # of this checkout
 SCENES = ji.data.ENGINE_SCENES
 LAWS = {
     "Moreau": ji.Moreau,
@@ -36,7 +38,9 @@ def outcomes(name):
     for law, make in LAWS.items():
         run = jax.jit(jax.vmap(lambda e, make=make: ji.impact(make(e), scene, v)))
         out = run(COEFFICIENTS)
-        usable = ~np.array([status.failure for status in ji.STATUS])[np.asarray(out.status)]
+        usable = ~np.array([status.failure for status in ji.STATUS])[
+            np.asarray(out.status)
+        ]
         found[law] = np.where(usable[:, None], out.velocity, np.nan)
     return found
 
@@ -72,7 +76,9 @@ def nearest(velocity, masses, laws):
 def with_laws(rows):
     """Rows of the table, each a dict, with the columns of laws computed anew."""
     jax.config.update("jax_enable_x64", True)
-    found = {name: outcomes(name) for name in dict.fromkeys(row["scene"] for row in rows)}
+    found = {
+        name: outcomes(name) for name in dict.fromkeys(row["scene"] for row in rows)
+    }
     for row in rows:
         masses = SCENES[row["scene"]].masses
         velocity = [row[f"v{i + 1}"] for i in range(len(masses))]

@@ -17,17 +17,28 @@ def lammps(after):
         for damping in ("coeff_restitution", "tsuji"):
             for more in ("", " limit_damping"):
                 setting = {"contact": contact, "damping": damping + more, "step": 1e-6}
-                yield contact + " " + damping + more, {e: after(*PAIR, e, **setting) for e in ASKED}
+                yield (
+                    contact + " " + damping + more,
+                    {e: after(*PAIR, e, **setting) for e in ASKED},
+                )
 
 
 def exudyn(after):
     for model in (1, 2):
-        setting = {"model": model, "exponent": 1.0, "stiffness": 1e5, "step": 1e-5, "gap": 0.01}
+        setting = {
+            "model": model,
+            "exponent": 1.0,
+            "stiffness": 1e5,
+            "step": 1e-5,
+            "gap": 0.01,
+        }
         yield f"impact model {model}", {e: after(*PAIR, e, **setting) for e in ASKED}
 
 
 def drake(after):
-    continuous = {d: after(*PAIR, 1, step=0.0, dissipation=d) for d in (0.1, 0.5, 1.0, 10.0)}
+    continuous = {
+        d: after(*PAIR, 1, step=0.0, dissipation=d) for d in (0.1, 0.5, 1.0, 10.0)
+    }
     yield "continuous, dissipation [s/m]", continuous
     setting = {"step": 1e-6, "stiffness": 1e5}
     times = (0.0, 5e-4, 1e-3, 2e-3)  # of each body [s]

@@ -29,7 +29,12 @@ def print_rows(engine, version, settings, after):
             found = after(masses, wall, restitution, **keywords)
             if found is not None:
                 velocity = [round(float(v) / speed, 6) for v in found]
-                row = {"engine": engine, "version": version, "scene": scene, "setting": setting}
+                row = {
+                    "engine": engine,
+                    "version": version,
+                    "scene": scene,
+                    "setting": setting,
+                }
                 print(json.dumps(row | {"velocity": velocity}), flush=True)
 
 

@@ -23,7 +23,9 @@ import nearest
 import numpy as np
 
 HERE = Path(__file__).parent
-PROGRAMS = {path.stem.removeprefix("engine_"): path for path in sorted(HERE.glob("engine_*.py"))}
+PROGRAMS = {
+    path.stem.removeprefix("engine_"): path for path in sorted(HERE.glob("engine_*.py"))
+}
 SAME = 1.5e-3  # largest difference of velocities called the same: the table has three decimals
 NEW, AS_BEFORE = "not in the table", "as in the table"
 
@@ -31,7 +33,8 @@ NEW, AS_BEFORE = "not in the table", "as in the table"
 def packages(program):
     """What a program names in its first lines, as PEP 723 has it."""
     return re.findall(
-        r'"([^"]+)"', re.search(r"^# dependencies = \[(.*)\]$", program.read_text(), re.M)[1]
+        r'"([^"]+)"',
+        re.search(r"^# dependencies = \[(.*)\]$", program.read_text(), re.M)[1],
     )
 
 
@@ -45,7 +48,9 @@ def python_of(name, folder, python):
         else:
             venv.create(inside, with_pip=True)
         install = [own, "-m", "pip", "install", "--quiet", *packages(PROGRAMS[name])]
-        subprocess.run(install, check=False)  # if it fails, the program says what is missing
+        subprocess.run(
+            install, check=False
+        )  # if it fails, the program says what is missing
     return own
 
 
@@ -53,11 +58,16 @@ def measured(name, python):
     """Rows of an engine, or what to install."""
     scenes = {key: list(scene) for key, scene in nearest.SCENES.items()}
     done = subprocess.run(
-        [python, PROGRAMS[name]], input=json.dumps(scenes), capture_output=True, text=True
+        [python, PROGRAMS[name]],
+        input=json.dumps(scenes),
+        capture_output=True,
+        text=True,
     )
     if "ModuleNotFoundError" in done.stderr:
         wanted = " ".join(f'"{package}"' for package in packages(PROGRAMS[name]))
-        python = re.search(r'^# requires-python = "(.*)"$', PROGRAMS[name].read_text(), re.M)
+        python = re.search(
+            r'^# requires-python = "(.*)"$', PROGRAMS[name].read_text(), re.M
+        )
         where = f" with a Python {python[1]}" if python else ""
         print(
             f"{name} is not installed: python -m pip install {wanted}{where}, or give --env FOLDER."
@@ -65,7 +75,9 @@ def measured(name, python):
         return []
     if done.returncode:
         raise SystemExit(f"{name} failed:\n{done.stderr}")
-    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    return [
+        json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")
+    ]
 
 
 def added(path):
@@ -78,7 +90,9 @@ def added(path):
             raise SystemExit(
                 f"{path}, line {number}: `scene` must be one of {known}, but is {line['scene']!r}."
             )
-        given = [line[key] for key in line if re.fullmatch(r"v\d", key or "") and line[key]]
+        given = [
+            line[key] for key in line if re.fullmatch(r"v\d", key or "") and line[key]
+        ]
         if len(given) != len(scene.masses):
             raise SystemExit(
                 f"{path}, line {number}: {line['scene']} has {len(scene.masses)} balls, but "
@@ -126,7 +140,9 @@ def comparison(line, old):
     if old is None:
         return NEW
     off = np.abs(velocity_of(line) - velocity_of(old)).max()
-    other = f", there version {old['version']}" if old["version"] != line["version"] else ""
+    other = (
+        f", there version {old['version']}" if old["version"] != line["version"] else ""
+    )
     return (AS_BEFORE if off < SAME else f"differs by {off:.3f} from the table") + other
 
 
@@ -142,17 +158,23 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("engines", nargs="*", metavar="ENGINE", help=", ".join(PROGRAMS))
+    parser.add_argument(
+        "engines", nargs="*", metavar="ENGINE", help=", ".join(PROGRAMS)
+    )
     for option in ("--env", "--python", "--add"):
         parser.add_argument(option)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     unknown = [name for name in given.engines if name not in PROGRAMS]
     if unknown:
-        parser.error(f"no such engine: {', '.join(unknown)}; there are {', '.join(PROGRAMS)}")
+        parser.error(
+            f"no such engine: {', '.join(unknown)}; there are {', '.join(PROGRAMS)}"
+        )
     rows = added(given.add) if given.add else []
     for name in given.engines or ([] if given.add else PROGRAMS):
-        python = python_of(name, given.env, given.python) if given.env else sys.executable
+        python = (
+            python_of(name, given.env, given.python) if given.env else sys.executable
+        )
         rows += measured(name, python)
     merged = {key_of(line): line for line in nearest.read_table()}
     for line in as_lines(rows):
