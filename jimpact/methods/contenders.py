@@ -124,8 +124,8 @@ def solved(
 
 
 _TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)  # in units of `time_scale`, coarse to fine
-_TO_NINE = (1e-3, 1e-5, 1e-7, 1e-9)
-_TO_ELEVEN = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
+_TO_NINE = (1e-3, 1e-5, 1e-7, 1e-9)  # relative tolerances, coarse to fine
+_TO_ELEVEN = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)  # the same, finer
 _ALL = (
     Contender(
         *(
