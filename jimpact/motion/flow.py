@@ -594,11 +594,11 @@ def one_pass(
     jumps = jumps & accept
     event = landed[:-1].at[: len(jumps)].max(jumps)  # another normal is an event, too
     steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
-    vanishes = flies & ~accept & (after.step.clock[1, 0] < _smallest_step(targets))
+    vanishes = flies & ~accept & (after.step.length[0, 0] < _smallest_step(targets))
     # what an event or a sample shortens says nothing of the steps after it
-    tried = flight.aim.clock[1, 0]
-    lands = flight.aim.clock[3, 0] > 0
-    proposed = after.step.clock[1, 0]
+    tried = flight.aim.length[0, 0]
+    lands = flight.aim.lands[0, 0] > 0
+    proposed = after.step.length[0, 0]
     longer = jnp.where(
         tried < flight.free, jnp.maximum(proposed, FORGET * flight.free), proposed
     )
@@ -619,7 +619,7 @@ def one_pass(
     )
     begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
     aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
-    in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
+    in_time = (after.step.in_root[0, 0] == 0) & (after.step.lands[0, 0] == 0)
     # the stepper keeps its plan for a landing, a step in the root of time, and a
     # rejected one
     plain = sampled | (accept & in_time)

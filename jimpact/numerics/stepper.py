@@ -223,9 +223,9 @@ def any_of(x: Bool[Array, "k *B"]) -> Bool[Array, "1 *B"]:
     return jnp.any(x, axis=0, keepdims=True)
 
 
-def _rows(x: Float[Array, "k B"]) -> list[Float[Array, "1 B"]]:
-    """The rows of an array, as arrays of one row."""
-    return [x[i : i + 1] for i in range(len(x))]
+def _row(x: Float[Array, "k B"], i: int) -> Float[Array, "1 B"]:
+    """Row i of an array, as an array of one row."""
+    return x[i : i + 1]
 
 
 def put(
@@ -239,13 +239,41 @@ def put(
     )
 
 
+class Clock(enum.IntEnum):
+    """Rows of the clock of a step."""
+
+    START = 0
+    LENGTH = 1
+    IN_ROOT = 2
+    LANDS = 3
+
+
 class Step(NamedTuple):
     """A step without its state: enough to repeat it."""
 
     modes: Int[Array, "modes B"]
     target: Bool[Array, "k B"]  # one-hot: the margin it lands on; none: a step in time
-    # xi at the beginning, length, 1 if xi is a root, 1 if it lands
-    clock: Float[Array, "4 B"]
+    clock: Float[Array, "4 B"]  # rows: see `Clock`
+
+    @property
+    def start(self) -> Float[Array, "1 B"]:
+        """The variable xi at the beginning."""
+        return _row(self.clock, Clock.START)
+
+    @property
+    def length(self) -> Float[Array, "1 B"]:
+        """The length of the step in xi; a landing has its own, from its margin."""
+        return _row(self.clock, Clock.LENGTH)
+
+    @property
+    def in_root(self) -> Float[Array, "1 B"]:
+        """1 where xi is the root of time, else 0."""
+        return _row(self.clock, Clock.IN_ROOT)
+
+    @property
+    def lands(self) -> Float[Array, "1 B"]:
+        """1 where the step lands on its target, else 0."""
+        return _row(self.clock, Clock.LANDS)
 
 
 class _StepVariable(NamedTuple):
@@ -265,26 +293,22 @@ def _frame(
     In time xi runs from the `start` of the clock for its length h; on a landing from c,
     the margin at the beginning, or its root, to 0.
     """
-    variable_at_start, h, in_root, lands = _rows(s.clock)
     const = flow.constants(s.modes)
+    lands = s.lands > 0
     c0 = flow.margins(const, s.modes, y)
     # a landing from a margin that is already 0 has length 0, and no root
     root = flow.rooted(s.modes) & (c0 > flow.zero_margin)
     xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
     xi0 = total(jnp.where(s.target, xi0, 0.0))
-    rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + in_root
-    start = jnp.where(lands > 0, xi0, variable_at_start)
+    rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + s.in_root
+    start = jnp.where(lands, xi0, s.start)
     # a margin that counts as 0 takes no time, however slow it is; its derivatives
     # remain
-    zero_length = (lands > 0) & (jnp.abs(xi0) <= flow.zero_margin)
-    length = jnp.where(
-        zero_length, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h)
-    )
-    return (
-        const,
-        jax.lax.stop_gradient(c0),
-        _StepVariable(start, length, rooted, zero_length),
-    )
+    zero_length = lands & (jnp.abs(xi0) <= flow.zero_margin)
+    length = jnp.where(lands, -xi0, s.length)
+    length = jnp.where(zero_length, jax.lax.stop_gradient(xi0) - xi0, length)
+    variable = _StepVariable(start, length, rooted, zero_length)
+    return const, jax.lax.stop_gradient(c0), variable
 
 
 class _StepResult(NamedTuple):
@@ -314,7 +338,6 @@ def _slopes(
     node c_i, and the sum `sum_j a_ij k_j` of slopes that leads to its state.
     """
     i, node, change = stage
-    lands = s.clock[3:4]
     xi = frame.start + node * frame.length
     now = y[: len(change)] + frame.length * change
     dy = flow.field(const, s.modes, now)
@@ -324,13 +347,13 @@ def _slopes(
         return flow.margins_with_rates(const, s.modes, now, dy[: len(now)], s.target)
 
     if flow.near:  # of costly margins: steps in time need them at their ends only
-        needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
+        needed = jnp.any(s.lands > 0) | (i == 0) | (i == STAGES)
         none = jnp.zeros_like(s.target, now.dtype)
         value, dc = cond(needed, rates_of_margins, lambda: (none, none))
     else:
         value, dc = rates_of_margins()
     # dt/dxi = N / R: N = 2 xi of a root, else 1; R = dc_k/dt of a landing, else 1
-    rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
+    rate = total(jnp.where(s.target, dc, 0.0)) + (1 - s.lands)
     rate = jnp.where(frame.zero_length & (rate == 0), jnp.inf, rate)
     dt = (1 + frame.rooted * (2 * xi - 1)) / rate
     rows = [dy[first:last] * dt for first, last in pairwise(ends)]
@@ -443,7 +466,8 @@ def _written_out(
             table.append(_with_row(empty, part, jnp.zeros((), jnp.uint32)))
         margins.append(margin)
     whole = [jax.tree.map(lambda *x: jnp.concatenate(x), *table) for table in tables]
-    return whole, (margins[0][1], *margins[-1])
+    _, first_rates = margins[0]
+    return whole, (first_rates, *margins[-1])
 
 
 def _weighted(
@@ -454,17 +478,18 @@ def _weighted(
     Equation: `h sum_i b_i k_i`, with the weights b of the method, then of both
     estimates.
     """
-    sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in tables]
-    inner, outer = (
-        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1))
-        if is_dual(k)
-        else x[0]
-        for x, k in zip(sums, tables)
-    )
-    change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
-    return change, value_of(length)[None] * jnp.concatenate(
-        [x[1:] for x in sums], axis=1
-    )
+    changes = []
+    errors = []
+    for slopes in tables:
+        sums = jnp.tensordot(weights, value_of(slopes), axes=1)
+        change = sums[0]
+        if is_dual(slopes):
+            tangents = jnp.tensordot(weights[0], slopes.tangents, axes=1)
+            change = Dual(change, tangents)
+        changes.append(change)
+        errors.append(sums[1:])
+    change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, *changes)
+    return change, value_of(length)[None] * jnp.concatenate(errors, axis=1)
 
 
 def _with_row(table: Any, new: list[Any], i: Integer[Array, ""]) -> Any:
@@ -514,32 +539,53 @@ class Intention(enum.IntEnum):
     AHEAD = 1
 
 
+class Progress(enum.IntEnum):
+    """Rows of the progress of an impact."""
+
+    EXPECTED = 0
+    AIMED_TWICE = 1
+    MARK = 2
+    PASSES = 3
+
+
 class StepperState(NamedTuple):
     """The state after a pass, and the step to try in the next one."""
 
     y: Any  # (n, B), which may be `Dual`
     step: Step  # the one to try
-    # (4, B): time it is expected to take; whether a landing already had to aim at
-    # another event; `Mark`; number of passes
-    progress: Float[Array, "4 B"]
+    progress: Float[Array, "4 B"]  # rows: see `Progress`
+
+    @property
+    def expected(self) -> Float[Array, "1 B"]:
+        """The time that the step is expected to take."""
+        return _row(self.progress, Progress.EXPECTED)
+
+    @property
+    def aimed_twice(self) -> Float[Array, "1 B"]:
+        """1 where a landing already had to aim at another event, else 0."""
+        return _row(self.progress, Progress.AIMED_TWICE)
+
+    @property
+    def mark_as_float(self) -> Float[Array, "1 B"]:
+        """`Mark` of each impact, as a floating-point number."""
+        return _row(self.progress, Progress.MARK)
 
     @property
     def mark(self) -> Int[Array, "1 B"]:
         """`Mark` of each impact."""
-        return self.progress[2:3].astype(jnp.int32)
+        return self.mark_as_float.astype(jnp.int32)
 
     @property
     def passes(self) -> Float[Array, "1 B"]:
         """Number of passes so far, a whole floating-point number."""
-        return self.progress[3:4]
+        return _row(self.progress, Progress.PASSES)
 
     def marked(self, which: Bool[Array, "1 B"], mark: Any) -> "StepperState":
         """The state with this `Mark` where `which` is True."""
-        old = self.progress[2:3]
-        new = jnp.where(which, jnp.asarray(mark, old.dtype), old)
-        return self._replace(
-            progress=self.progress.at[2:3].set(jax.lax.stop_gradient(new))
-        )
+        old = self.mark_as_float
+        new = jax.lax.stop_gradient(jnp.where(which, jnp.asarray(mark, old.dtype), old))
+        row = slice(Progress.MARK, Progress.MARK + 1)
+        return self._replace(progress=self.progress.at[row].set(new))
 
 
 def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
@@ -550,7 +596,7 @@ def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
     """
     start = dual_like((flow, start), start)
     flow, y = value_of((flow, start))
-    one = jnp.ones_like(y[:1])
+    one = jnp.ones_like(_row(y, 0))
     # xi = 0, a length in the root of time, no landing
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(
@@ -559,9 +605,8 @@ def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
     mark = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
-    return StepperState(
-        start, step, jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one])
-    )
+    progress = jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one])
+    return StepperState(start, step, progress)
 
 
 def goes_on(carry: StepperState, most: int) -> Bool[Array, "1 B"]:
@@ -581,22 +626,20 @@ def advance(
     s = state.step
     flow, y = value_of((flow, start))  # without tangents
     n = y.shape[0]
-    expected, aimed_twice, mark, passes = _rows(state.progress)
-    _, h, _, lands = _rows(s.clock)
-    change, errors, margins, rates = _stages(duals, s, start, ends=True)
-    error2 = _squared_error(flow, s, y, errors, passes)
+    lands = s.lands > 0
+    change, errors, (c0, c1), (d0, d1) = _stages(duals, s, start, ends=True)
+    error2 = _squared_error(flow, s, y, errors, state.passes)
     ok = error2 <= 1
     elapsed = value_of(change)[n:]  # the last row is time
-    duration = jnp.where(ok & (elapsed > 0), elapsed, expected)
-    slopes = rates[0] * duration, rates[1] * duration
-    urgent = _most_urgent(*_intentions(flow, s, aimed_twice, margins, slopes))
+    duration = jnp.where(ok & (elapsed > 0), elapsed, state.expected)
+    course = _Course(c0, c1, d0 * duration, d1 * duration)
+    urgent = _most_urgent(*_intentions(flow, s, state.aimed_twice, course))
     active = goes_on(state, most)
     accept = ok & (urgent.intention == Intention.AHEAD) & active
-    landed = accept & (lands > 0)
-    events = s.target & landed  # one-hot
+    events = s.target & (accept & lands)  # one-hot
     # the field has no value, however short the step: given up, and the status reports
     # it
-    broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
+    broken = active & ~lands & ~(error2 < jnp.inf) & (s.length < SHORTEST)
 
     def after(
         flow: Flow, y: Float[Array, "n B"], change: Float[Array, "_ B"]
@@ -610,18 +653,16 @@ def advance(
     modes, end = pushforward(after, duals, start, change)
     end = dual_like(start, end)
     step, next_duration = _next_step(flow, s, modes, urgent, accept, error2, duration)
-    passes = passes + active.astype(y.dtype)
+    passes = state.passes + active.astype(y.dtype)
+    mark = state.mark_as_float
     pauses = flow.pauses(s.modes, modes, passes)
     if pauses is not None:
         mark = jnp.where(active & pauses, Mark.PAUSED, mark)
     over = flow.over(modes, value_of(end), passes) | broken
-    aimed_twice = (
-        (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < Intention.AHEAD)
-    )
+    aimed_twice = (step.lands > 0) & lands & (urgent.intention < Intention.AHEAD)
     mark = jnp.where(over, Mark.OVER, mark)
-    progress = jnp.concatenate(
-        [next_duration, aimed_twice.astype(y.dtype), mark, passes]
-    )
+    rows = [next_duration, aimed_twice.astype(y.dtype), mark, passes]
+    progress = jnp.concatenate(rows)
     return StepperState(end, *jax.lax.stop_gradient((step, progress))), accept
 
 
@@ -649,74 +690,91 @@ def _squared_error(
     return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
 
 
-def _intentions(
-    flow: Flow,
-    s: Step,
-    aimed_twice: Float[Array, "1 B"],
-    values: tuple[Float[Array, "k B"], Float[Array, "k B"]],
-    slopes: tuple[Float[Array, "k B"], Float[Array, "k B"]],
-) -> tuple[Int[Array, "k B"], Float[Array, "k B"]]:
-    """Intention and distance of each margin, from values and slopes at both ends of a
-    step.
+class _Course(NamedTuple):
+    """Margins over a step: values c and slopes d, for a step of length 1, at both ends.
 
-    In units of the step, with v = 1 - u, a margin within the step is Hermite's cubic
+    Within the step a margin is Hermite's cubic, with v = 1 - u
 
-        c(u) = (c0 (1 + 2 u) + d0 u) v^2 + (c1 (1 + 2 v) - d1 v) u^2,
-
-    and at the distance w behind its end the parabola c1 + d1 w + (d1 - d0) w^2 / 2.
+        c(u) = (c0 (1 + 2 u) + d0 u) v^2 + (c1 (1 + 2 v) - d1 v) u^2.
     """
-    c0, c1 = values
-    d0, d1 = slopes
+
+    c0: Float[Array, "k B"]
+    c1: Float[Array, "k B"]
+    d0: Float[Array, "k B"]
+    d1: Float[Array, "k B"]
+
+    def at(self, u: Float[Array, "k B"]) -> Float[Array, "k B"]:
+        """Values c(u) at the places u of a step from 0 to 1."""
+        c0, c1, d0, d1 = self
+        v = 1 - u
+        from_start = (c0 * (1 + 2 * u) + d0 * u) * v * v
+        return from_start + (c1 * (1 + 2 * v) - d1 * v) * u * u
+
+
+def _intentions(
+    flow: Flow, s: Step, aimed_twice: Float[Array, "1 B"], course: _Course
+) -> tuple[Int[Array, "k B"], Float[Array, "k B"]]:
+    """Intention and distance of each margin, from its course over the step `s`.
+
+    A margin that has crossed 0 within the step is landed on where that can be done from
+    the beginning of the step, else the step is shortened, as for one that dips below 0
+    and returns; the distance is the place of the root or of the minimum. Others are
+    ahead: distance of the root behind the end, or inf.
+    """
+    c0, c1, d0, d1 = course
     zero = flow.zero_margin
-    lands = s.clock[3:4] > 0
     free = ~s.target
     crossed = free & (c1 < -zero)
     turns = free & (d0 < 0) & (d1 > 0) & (c0 > zero)
-    u = _place_within(flow, crossed, values, slopes)
-    v = 1 - u
-    minimum = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
-    dipped = turns & (minimum < DOUBT * (d1 - d0) - zero)
+    place = _place_within(flow, crossed, course)
+    dips = turns & (course.at(place) < DOUBT * (d1 - d0) - zero)
     at_once = (c0 <= zero) & (d0 <= 0)
     if flow.near:
         direct = at_once
     else:
         direct = at_once | ((d0 < 0) & (c0 > zero))
     direct = direct & (aimed_twice == 0)
-    # the parabola has no root where a margin only creeps towards 0
+    ahead = _distance_ahead(zero, free & ~turns & ~(s.lands > 0), course)
+    intention = jnp.where(dips, Intention.SHORTEN, Intention.AHEAD)
+    crossing = jnp.where(direct, Intention.LAND, Intention.SHORTEN)
+    intention = jnp.where(crossed, crossing, intention)
+    place = jnp.where(crossed & direct & at_once, 0.0, place)
+    return intention, jnp.where(crossed | dips, place, ahead)
+
+
+def _distance_ahead(
+    zero: Float[Array, "1 B"], which: Bool[Array, "k B"], course: _Course
+) -> Float[Array, "k B"]:
+    """Distance w behind the end of a step at which margins vanish, inf for those that
+    do not, and for others than `which`.
+
+    There a margin is the parabola `c1 + d1 w + (d1 - d0) w^2 / 2`, which has no root
+    where the margin only creeps towards 0.
+    """
+    _, c1, d0, d1 = course
     discriminant = d1 * d1 - 2 * (d1 - d0) * c1
-    ahead = free & ~turns & (d1 < 0) & (c1 > zero) & (discriminant > 0) & ~lands
-    w = (
-        2
-        * c1
-        / (jnp.sqrt(jnp.where(ahead, discriminant, 1.0)) - jnp.where(ahead, d1, 0.0))
-    )
-    w = jnp.where(ahead, w, jnp.inf)
-    intention = jnp.where(dipped, Intention.SHORTEN, Intention.AHEAD)
-    intention = jnp.where(
-        crossed, jnp.where(direct, Intention.LAND, Intention.SHORTEN), intention
-    )
-    u = jnp.where(crossed & direct & at_once, 0.0, u)
-    return intention, jnp.where(crossed | dipped, u, w)
+    ahead = which & (d1 < 0) & (c1 > zero) & (discriminant > 0)
+    root = jnp.sqrt(jnp.where(ahead, discriminant, 1.0))
+    w = 2 * c1 / (root - jnp.where(ahead, d1, 0.0))
+    return jnp.where(ahead, w, jnp.inf)
 
 
 def _place_within(
-    flow: Flow,
-    crossed: Bool[Array, "k B"],
-    values: tuple[Float[Array, "k B"], Float[Array, "k B"]],
-    slopes: tuple[Float[Array, "k B"], Float[Array, "k B"]],
+    flow: Flow, crossed: Bool[Array, "k B"], course: _Course
 ) -> Float[Array, "k B"]:
     """Places u in a step at which margins vanish if they have `crossed` 0, otherwise
     turn.
+
+    The first is the root of the chord `c0 + (c1 - c0) u`, of a margin that rises and
+    falls back the root of the parabola `c0 + d0 u + (c1 - c0 - d0) u^2`; the second is
+    the root of the slope `d0 + (d1 - d0) u`. A flow with `near` has the root of the
+    cubic.
     """
-    c0, c1 = values
-    d0, d1 = slopes
-    # the root of the chord c0 + (c1 - c0) u, or of the slope d0 + (d1 - d0) u
+    c0, c1, d0, d1 = course
     above = jnp.maximum(c0, 0.0)
     part = jnp.where(crossed, above, -d0)
     whole = jnp.where(crossed, c0 - c1, d1 - d0)
     u = part / jnp.where(whole > 0, whole, jnp.inf)
-    # a margin that rises and falls back: the root of the parabola c0 + d0 u + (c1 - c0
-    # - d0) u^2
     rises = crossed & (d0 > 0)
     bend = jnp.where(rises, above + d0 - c1, 1.0)
     root = jnp.sqrt(jnp.where(rises, d0 * d0 + 4 * bend * above, 1.0))
@@ -724,15 +782,15 @@ def _place_within(
     if flow.near:
         # a step in time precedes the landing: dt/dxi is singular at the top of a
         # parabola
-        u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
+        u = jnp.where(crossed, _root_of_cubic(u, course), u)
     return u
 
 
 class _Urgent(NamedTuple):
     """The margin that decides about the next step."""
 
-    intention: Int[Array, "1 B"]  # (1, B)
-    distance: Float[Array, "1 B"]  # (1, B)
+    intention: Int[Array, "1 B"]
+    distance: Float[Array, "1 B"]
     target: Bool[Array, "k B"]  # one-hot
 
 
@@ -743,11 +801,8 @@ def _most_urgent(
     the row.
     """
     # below 0: SHORTEN; from 0 to 1: LAND at this part of the step; above: AHEAD
-    order = (
-        intention
-        + distance
-        + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
-    )
+    tie = TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
+    order = intention + distance + tie
     first = jnp.min(order, axis=0, keepdims=True)
     not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
     chosen = jnp.where(first < Intention.LAND, Intention.SHORTEN, not_before)
@@ -767,13 +822,13 @@ def _next_step(
 
     `duration` is the time that `s` takes, `error2` its error in tolerances, squared.
     """
-    start, length, in_root, lands = _rows(s.clock)
+    length = s.length
+    lands = s.lands > 0
     ok = error2 <= 1
     event = urgent.intention < Intention.AHEAD
-    lands = lands > 0
     # xi goes on from the end of an accepted step
-    in_root = (in_root > 0) & ~lands
-    start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
+    in_root = (s.in_root > 0) & ~lands
+    start = jnp.where(in_root, s.start + jnp.where(accept, length, 0.0), 0.0)
     # the length: shorter before an event or after a failed landing, else by the error
     shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
     at_event = jnp.where(urgent.intention == Intention.SHORTEN, shorter, length)
@@ -793,7 +848,8 @@ def _next_step(
     proposed = jnp.where(aim & in_root, expected, proposed)
     in_root = in_root & ~aim
     flags = [x.astype(length.dtype) for x in (in_root, aim)]
-    step = Step(modes, aim & urgent.target, jnp.concatenate([start, proposed, *flags]))
+    clock = jnp.concatenate([start, proposed, *flags])
+    step = Step(modes, aim & urgent.target, clock)
     return step, jnp.where(aim, urgent.distance * duration, expected)
 
 
@@ -822,15 +878,11 @@ def _shorter_length(
         part = 1 - flow.near
     else:
         part = CUT
-    cut = jnp.where(
-        ok & (urgent.intention == Intention.SHORTEN), part * urgent.distance, 0.5
-    )
-    length = s.clock[1:2]
-    lands = s.clock[3:4] > 0
+    shortens = ok & (urgent.intention == Intention.SHORTEN)
+    cut = jnp.where(shortens, part * urgent.distance, 0.5)
     # a landing is not in time: the shorter step is
-    return jnp.where(
-        in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length)
-    )
+    in_time = cut * jnp.where(s.lands > 0, duration, s.length)
+    return jnp.where(in_root, jnp.sqrt(cut) * s.length, in_time)
 
 
 def _restart_in_root(
@@ -862,19 +914,13 @@ def _reaches_event(
     return reached
 
 
-def _root_of_cubic(
-    u: Float[Array, "k B"],
-    c0: Float[Array, "k B"],
-    d0: Float[Array, "k B"],
-    c1: Float[Array, "k B"],
-    d1: Float[Array, "k B"],
-) -> Float[Array, "k B"]:
-    """The root in [0, 1] near u of the cubic with values c and slopes d at 0 and 1.
+def _root_of_cubic(u: Float[Array, "k B"], course: _Course) -> Float[Array, "k B"]:
+    """The root in [0, 1] near u of the cubic of the course.
 
-    By Newton's method on `c0 v + c1 u + u v (v a + u b)`, v = 1 - u, a = d0 - (c1 -
-    c0),
-    b = (c1 - c0) - d1.
+    By Newton's method on `c0 v + c1 u + u v (v a + u b)`, with v = 1 - u,
+    a = d0 - (c1 - c0) and b = (c1 - c0) - d1.
     """
+    c0, c1, d0, d1 = course
     rise = c1 - c0
     a = d0 - rise
     b = rise - d1
@@ -895,16 +941,13 @@ def between(
 
     In the root xi of time, `xi^2 = xi_0^2 + ahead`.
     """
-    variable_at_start = s.clock[:1]
-    in_root = s.clock[2:3]
-    lands = s.clock[3:4]
-    in_root = in_root * (1 - lands)
-    variable_at_start = variable_at_start * in_root
-    reached = variable_at_start**2 + ahead
+    in_root = s.in_root * (1 - s.lands)
+    start = s.start * in_root
+    reached = start**2 + ahead
     positive = reached > 0
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
-    h = jnp.where(in_root > 0, root - variable_at_start, ahead)
-    clock = jnp.concatenate([variable_at_start, h, in_root, jnp.zeros_like(h)])
+    h = jnp.where(in_root > 0, root - start, ahead)
+    clock = jnp.concatenate([start, h, in_root, jnp.zeros_like(h)])
     return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
 
 
