@@ -6,6 +6,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+def normals_of(x: Float[Array, "m b *N"]) -> Float[Array, "m 1 *N"]:
+    """The normal rows of impulses or rates x, first of the b rows of each contact."""
+    return x[:, :1]
+
+
+def tangents_of(x: Float[Array, "m b *N"]) -> Float[Array, "m rows *N"]:
+    """The tangential rows of impulses or rates x, behind the normal one."""
+    return x[:, 1:]
+
+
 def length_of(vectors: Float[Array, "m rows N"]) -> Float[Array, "m N"]:
     """Lengths |v|; the derivative of 0 is 0."""
     squares = jnp.sum(vectors**2, axis=1)
@@ -16,10 +26,9 @@ def over(
     vectors: Float[Array, "m rows N"], length: Float[Array, "m #N"]
 ) -> Float[Array, "m rows N"]:
     """Vectors over lengths, v / length; 0 where the length is 0."""
-    return (
-        jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None]
-        * vectors
-    )
+    positive = length > 0
+    inverse = jnp.where(positive, 1 / jnp.where(positive, length, 1.0), 0.0)
+    return inverse[:, None] * vectors
 
 
 def in_disc(
@@ -27,6 +36,5 @@ def in_disc(
 ) -> Float[Array, "m rows N"]:
     """Projections on discs: the points with |v| <= radius nearest to `side`."""
     length = length_of(side)
-    return jnp.where(
-        (length > radius)[:, None], over(side, length) * radius[:, None], side
-    )
+    outside = (length > radius)[:, None]
+    return jnp.where(outside, over(side, length) * radius[:, None], side)

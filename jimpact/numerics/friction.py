@@ -30,7 +30,13 @@ from jimpact.numerics.dense import (
     singular_values,
     times,
 )
-from jimpact.numerics.discs import in_disc, length_of, over
+from jimpact.numerics.discs import (
+    in_disc,
+    length_of,
+    normals_of,
+    over,
+    tangents_of,
+)
 from jimpact.numerics.interior_points import (
     ATTEMPTS,
     Best,
@@ -184,20 +190,20 @@ def solve(
     of_contacts = matrix[order[:, :, None, None], order[None, None]]
     # unknowns are scaled to a diagonal of 1, both tangents of a contact alike
     squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
-    squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
+    of_tangents = jnp.mean(tangents_of(squares), axis=1)
+    squares = jnp.stack([squares[:, 0], of_tangents], axis=1)
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
-    scale = 1 / jnp.repeat(
-        norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows
-    )
+    repeats = np.array([1, rows])
+    scale = 1 / jnp.repeat(norm, repeats, axis=1, total_repeat_length=1 + rows)
     rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
-    friction = friction * norm[:, 1] / norm[:, 0]
+    friction = friction * norm[:, -1] / norm[:, 0]
     of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
     drag = jnp.zeros((m, rows), matrix.dtype)  # p_t / p of contacts whose slip is known
     # their p_t = drag p moves into the column of p; unit rows of p_t
     if sliding is not None:
         slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
         drag = -friction[:, None] * sliding.reshape(m, rows)
-        dragged = jnp.sum(of_contacts[..., 1:] * drag[None, None], axis=3)
+        dragged = jnp.sum(_of_tangents(of_contacts) * drag[None, None], axis=3)
         of_contacts = of_contacts.at[..., 0].add(dragged)
         decoupled = jnp.pad(jnp.repeat(slides[:, None], rows, axis=1), ((0, 0), (1, 0)))
         apart = decoupled[:, :, None, None] | decoupled[None, None]
@@ -207,14 +213,11 @@ def solve(
         friction = jnp.where(slides, 0.0, friction)
     largest = jax.lax.stop_gradient(jnp.abs(rate).max())
     size = jnp.where(largest > 0, largest, 1.0)
-    problem = _FrictionProblem(
-        of_contacts,
-        rate / size,
-        friction,
-        None if load is None else load * norm[:, 0] / size,
-        complementary,
-    )
-    fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
+    if load is not None:
+        load = load * norm[:, 0] / size
+    numbers = (of_contacts, rate / size, friction, load)
+    problem = _FrictionProblem(*numbers, complementary)
+    fixed = _FrictionProblem(*jax.lax.stop_gradient(numbers), complementary)
     decision = (_enumerate if m <= ENUMERATED else _search)(fixed)
     decided = decision.impulse
     modes, inverted = _most_at_rest(fixed, decision.modes, decided)
@@ -226,20 +229,18 @@ def solve(
     )[0]
     wrong = ~(missed <= fixed.tolerance)
     status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
-    x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
-    # rounding
+    dragged = tangents_of(x) + drag * normals_of(x)
+    x = jnp.concatenate([normals_of(x), dragged], axis=1) * scale * size
+    p = x[:, 0]
     if complementary:
-        p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0])
-    else:
-        p = x[:, 0]
+        p = jnp.where(p < 0, 0.0, p)  # rounding
     free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
     free = _normals_first(free)
     shares = None
     if decision.others is not None:
-        shares = _normals_first(
-            jax.lax.stop_gradient(scale * size)[..., None] * decision.others
-        ).T
-    return FrictionImpulses(p, x[:, 1:].reshape(-1), status, free, shares)
+        units = jax.lax.stop_gradient(scale * size)[..., None]
+        shares = _normals_first(units * decision.others).T
+    return FrictionImpulses(p, tangents_of(x).reshape(-1), status, free, shares)
 
 
 class _Decision(NamedTuple):
@@ -256,7 +257,12 @@ def _normals_first(x: Float[Array, "m b N"]) -> Float[Array, "n N"]:
     """Rows of contacts reordered: the normal of each, then the tangents,
     contact-major.
     """
-    return jnp.concatenate([x[:, 0], x[:, 1:].reshape(-1, x.shape[2])])
+    return jnp.concatenate([x[:, 0], tangents_of(x).reshape(-1, x.shape[2])])
+
+
+def _of_tangents(matrix: Float[Array, "m b m b"]) -> Float[Array, "m b m rows"]:
+    """The columns of a matrix that multiply tangential impulses."""
+    return matrix[..., 1:]
 
 
 # ------------------------------------------------------------------- the equations of
@@ -283,9 +289,9 @@ def _times(
 def _bound(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, "m N"]:
     """Radii `mu (max(p, 0) + load)` of the discs of friction."""
     p = jnp.maximum(x[:, 0], 0.0)
-    return problem.friction[:, None] * (
-        p if problem.load is None else p + problem.load[:, None]
-    )
+    if problem.load is not None:
+        p = p + problem.load[:, None]
+    return problem.friction[:, None] * p
 
 
 def _rubs(problem: _FrictionProblem) -> Bool[Array, "m 1"]:
@@ -316,14 +322,16 @@ def _misfit(
     rate = _rates(problem, x)
     p = x[:, 0]
     r = rate[:, 0]
-    side = x[:, 1:]
+    side = tangents_of(x)
     if problem.complementary:
         normal = jnp.minimum(p, r)
     else:
         normal = r
-    wrong = side - in_disc(side - rate[:, 1:], _bound(problem, x))
+    wrong = side - in_disc(side - tangents_of(rate), _bound(problem, x))
     most = jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1)))
-    return most / (_size(x) if size is None else size)
+    if size is None:
+        size = _size(x)
+    return most / size
 
 
 def _equations(
@@ -339,25 +347,20 @@ def _equations(
     """
     m, rows = modes.direction.shape[:2]
     dtype = problem.matrix.dtype
-    q = (
-        modes.sticks[:, None, None].astype(dtype)
-        * jnp.eye(rows, dtype=dtype)[None, ..., None]
-    )
+    one = jnp.eye(rows, dtype=dtype)[None, ..., None]
+    q = modes.sticks[:, None, None].astype(dtype) * one
     if rows == 2:
-        e = jnp.stack([-modes.direction[:, 1], modes.direction[:, 0]], axis=1)
+        first, second = jnp.moveaxis(modes.direction, 1, 0)
+        e = jnp.stack([-second, first], axis=1)
         q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
-    q = (
-        jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0)))
-        .at[:, 0, 0]
-        .set(modes.taking.astype(dtype))
-    )
+    q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0)))
+    q = q.at[:, 0, 0].set(modes.taking.astype(dtype))
     unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
     own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
-    first = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
-    friction_direction = jnp.pad(
-        modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0))
-    )
-    pressed = friction_direction[:, :, None, None] * own * first
+    of_normal = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
+    friction_direction = modes.direction * problem.friction[:, None, None]
+    friction_direction = jnp.pad(friction_direction, ((0, 0), (1, 0), (0, 0)))
+    pressed = friction_direction[:, :, None, None] * own * of_normal
     # term by term: in single precision XLA may crash on sums within batches of so many
     # axes
     apart = (problem.matrix - unit)[..., None]
@@ -379,17 +382,16 @@ def _turned(
     """
     if modes.direction.shape[1] == 1:
         return modes
-    slip = _rates(problem, x)[:, 1:]
+    slip = tangents_of(_rates(problem, x))
     # along d where a contact slides, and where it only reaches its cone
-    pull = slip - x[:, 1:]
+    pull = slip - tangents_of(x)
     length = length_of(pull)
     bound = _bound(problem, x)
     slides = (length_of(modes.direction) > 0) & (length > 0)
     direction = jnp.where(slides[:, None], over(pull, length), modes.direction)
     both = bound + length_of(slip)
-    turning = jnp.where(
-        slides & (both > 0), bound / jnp.where(both > 0, both, 1.0), 0.0
-    )
+    share = bound / jnp.where(both > 0, both, 1.0)
+    turning = jnp.where(slides & (both > 0), share, 0.0)
     return modes._replace(direction=direction, turning=turning)
 
 
@@ -424,19 +426,16 @@ def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarr
     else:
         slides = _DIRECTIONS
     if not loaded:
-        kinds = itertools.product(range(2 + slides), repeat=contacts)
+        unloaded = itertools.product(range(2 + slides), repeat=contacts)
         table = np.array(
-            sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))
+            sorted(unloaded, key=lambda k: (np.count_nonzero(k), k.count(1)))
         ).T
         return table, table != 1
-    each = [
-        (kind, taking)
-        for kind in (0, *range(2, 2 + slides))
-        for taking in (True, False)
-    ]
-    both = itertools.product(each, repeat=contacts)
-    table = np.array(sorted(both, key=lambda k: sum((kind > 0) for kind, _ in k))).T
-    return table[0], table[1] == 1
+    of_contact = itertools.product((0, *range(2, 2 + slides)), (True, False))
+    of_all = itertools.product(list(of_contact), repeat=contacts)
+    ordered = sorted(of_all, key=lambda k: sum((kind > 0) for kind, _ in k))
+    kinds, taking = np.array(ordered).T
+    return kinds, taking == 1
 
 
 def _enumerate(problem: _FrictionProblem) -> _Decision:
@@ -454,7 +453,7 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
     turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
-        begin = problem.rate[:, 1:, None] + 0.0
+        begin = tangents_of(problem.rate)[..., None] + 0.0
         begin = jnp.where(length_of(begin)[:, None] > 0, begin, 1.0)
         begin = over(begin, length_of(begin))
     modes = _Modes(
@@ -521,14 +520,15 @@ def _at_rest(
         taking = jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:
         begins = (problem.load > 0) & (problem.load < precision(x.dtype).eps)
-        taking = taking & ~(begins[:, None] & (x[:, :1] <= margin))
-    pushes = taking & (x[:, :1] >= -margin)
+        taking = taking & ~(begins[:, None] & (normals_of(x) <= margin))
+    pushes = taking & (normals_of(x) >= -margin)
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
-    speed = length_of(rate[:, 1:])
+    slip = tangents_of(rate)
+    speed = length_of(slip)
     slides = pushes & (speed > margin)
     sticks = pushes & ~slides & _rubs(problem)
-    direction = jnp.where(slides[:, None], over(rate[:, 1:], speed), 0.0)
+    direction = jnp.where(slides[:, None], over(slip, speed), 0.0)
     modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
     return _turned(problem, modes, x[..., None])
 
@@ -663,7 +663,7 @@ def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
         taking = p > rate[:, 0]
     else:
         taking = jnp.ones(p.shape, bool)
-    pull = rate[:, 1:] - x[:, 1:]
+    pull = tangents_of(rate) - tangents_of(x)
     bound = _bound(problem, x)
     length = length_of(pull)
     sticks = (length <= bound) & _rubs(problem)
@@ -672,12 +672,19 @@ def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
     return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
 
 
+class _Polish(NamedTuple):
+    """Impulses of Newton's method, the best so far, and the number of steps done."""
+
+    impulse: Float[Array, "m b"]
+    best: Best
+    steps: Int[Array, ""]
+
+
 def _search(problem: _FrictionProblem) -> _Decision:
     """Modes of many contacts; other shares are not looked for.
 
     By attempts of interior points, the last one by projections where contacts may part,
-    each
-    with Newton's method on the modes that it leads to.
+    each with Newton's method on the modes that it leads to.
     """
 
     def misfit(x: Float[Array, "m b"]) -> Float[Array, ""]:
@@ -692,18 +699,18 @@ def _search(problem: _FrictionProblem) -> _Decision:
         missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
         return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
 
-    def newton(
-        state: tuple[Float[Array, "m b"], Best, Int[Array, ""]],
-    ) -> tuple[Float[Array, "m b"], Best, Int[Array, ""]]:
-        """x after a step of Newton's method, which may be worse; the best x; steps
-        done.
-        """
-        x = polish(state[0])
-        return x, better(misfit, state[1], x), state[2] + 1
+    def newton(now: _Polish) -> _Polish:
+        """The next x of Newton's method, which may be worse, and the best x."""
+        x = polish(now.impulse)
+        return _Polish(x, better(misfit, now.best, x), now.steps + 1)
 
     def wrong(best: Best) -> Bool[Array, ""]:
         """True if the law is not satisfied; also where the misfit is NaN."""
         return ~(best.misfit <= problem.tolerance)
+
+    def goes_on(now: _Polish) -> Bool[Array, ""]:
+        """True while the best x is wrong and steps are left."""
+        return wrong(now.best) & (now.steps < _POLISHES)
 
     def attempt(state: tuple[Best, Int[Array, ""]]) -> tuple[Best, Int[Array, ""]]:
         """The best so far, or what attempt `number` leads to, and the number of the
@@ -715,17 +722,19 @@ def _search(problem: _FrictionProblem) -> _Decision:
             last = number == ATTEMPTS
             swept = _projected(problem, best.impulse, last)
             tried = better(misfit, tried, jnp.where(last, swept, tried.impulse))
-        _, tried, _ = while_loop(
-            lambda s: wrong(s[1]) & (s[2] < _POLISHES),
-            newton,
-            (tried.impulse, tried, jnp.asarray(0)),
-        )
+        begin = _Polish(tried.impulse, tried, jnp.asarray(0))
+        tried = while_loop(goes_on, newton, begin).best
         less = tried.misfit < best.misfit
-        return jax.tree.map(lambda a, b: jnp.where(less, a, b), tried, best), number + 1
+        best = jax.tree.map(lambda a, b: jnp.where(less, a, b), tried, best)
+        return best, number + 1
 
-    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(
-        problem.matrix.shape
-    )
+    def attempts_left(state: tuple[Best, Int[Array, ""]]) -> Bool[Array, ""]:
+        """True while the best impulses are wrong and attempts are left."""
+        best, number = state
+        return wrong(best) & (number < most)
+
+    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype)
+    unit = unit.reshape(problem.matrix.shape)
     cones = cones_of(*problem)
     none = jnp.zeros_like(problem.rate)
     start = Best(none, jnp.inf + 0 * jnp.sum(problem.rate)), jnp.asarray(0)
@@ -733,7 +742,7 @@ def _search(problem: _FrictionProblem) -> _Decision:
         most = ATTEMPTS + 1
     else:
         most = ATTEMPTS
-    best, _ = while_loop(lambda s: wrong(s[0]) & (s[1] < most), attempt, start)
+    best, _ = while_loop(attempts_left, attempt, start)
     status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
     return _Decision(_modes_at(problem, best.impulse), best.impulse, status, None)
 
@@ -820,6 +829,14 @@ def _lengths(force: Float[Array, "t *B"], rows: int) -> Float[Array, "m *B"]:
     return jnp.sqrt(jnp.sum(force.reshape(-1, rows, *force.shape[1:]) ** 2, axis=1))
 
 
+class _Sweep(NamedTuple):
+    """Tangential forces after a sweep, if it changed them, and those done."""
+
+    force: Float[Array, "t B"]
+    changes: Bool[Array, ""]
+    done: Int[Array, ""]
+
+
 def _relaxed(
     matrix: Float[Array, "t t B"], rate: Float[Array, "t B"], limit: Float[Array, "m B"]
 ) -> Float[Array, "t B"]:
@@ -832,10 +849,7 @@ def _relaxed(
     least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
     of_contacts = matrix.reshape(m, rows, t, *batch)
     own = matrix[np.arange(t), np.arange(t)].reshape(m, rows, *batch)
-    if rows == 1:
-        stiffness = own[:, 0]
-    else:
-        stiffness = own[:, 0] + own[:, 1]
+    stiffness = jnp.sum(own, axis=1)
     stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
 
     def relax(
@@ -845,26 +859,24 @@ def _relaxed(
         disc j.
         """
         at_contact = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
-        change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(
-            of_contacts[j], force
-        )
+        at_rest = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows)
+        change = at_rest + times(of_contacts[j], force)
         tried = at_contact - change / stiffness[j]
         most = limit[j][None]
         length = _lengths(tried, rows)
-        shrink = jnp.where(
-            length > most, most / jnp.where(length > 0, length, 1.0), 1.0
-        )
+        ratio = most / jnp.where(length > 0, length, 1.0)
+        shrink = jnp.where(length > most, ratio, 1.0)
         return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
 
-    def sweep(
-        state: tuple[Float[Array, "t B"], Bool[Array, ""], Int[Array, ""]],
-    ) -> tuple[Float[Array, "t B"], Bool[Array, ""], Int[Array, ""]]:
-        """Forces after each contact was relaxed, whether any changed, and the sweeps so
-        far.
-        """
-        before, _, count = state
-        force = fori_loop(0, m, relax, before)
-        return force, jnp.any(jnp.abs(force - before) > least), count + 1
+    def sweep(now: _Sweep) -> _Sweep:
+        """The forces after each contact was relaxed once more."""
+        force = fori_loop(0, m, relax, now.force)
+        changes = jnp.any(jnp.abs(force - now.force) > least)
+        return _Sweep(force, changes, now.done + 1)
 
-    start = (jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))
-    return while_loop(lambda s: s[1] & (s[2] < _RELAXATIONS), sweep, start)[0]
+    def goes_on(now: _Sweep) -> Bool[Array, ""]:
+        """True while forces change and sweeps are left."""
+        return now.changes & (now.done < _RELAXATIONS)
+
+    start = _Sweep(jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))
+    return while_loop(goes_on, sweep, start).force

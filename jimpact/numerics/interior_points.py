@@ -25,9 +25,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.numerics.dense import block_solve
+from jimpact.numerics.discs import tangents_of
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import fori_loop, while_loop
 from jimpact.tools.precision import precision
@@ -59,10 +60,10 @@ class Cones(NamedTuple):
     columns.
     """
 
-    coupling: Float[Array, "m b m b"]  # (m, b, m, b)
-    constant: Float[Array, "m b"]  # (m, b)
-    scale: Float[Array, "m b"]  # (m, b)
-    load: Float[Array, " m"]  # (m,)
+    coupling: Float[Array, "m b m b"]
+    constant: Float[Array, "m b"]
+    scale: Float[Array, "m b"]
+    load: Float[Array, " m"]
     complementary: bool
 
 
@@ -84,6 +85,14 @@ class Best(NamedTuple):
 
     impulse: Float[Array, "m b"]
     misfit: Float[Array, ""]
+
+
+class _Iterate(NamedTuple):
+    """A point, the best impulses so far, and iterations done."""
+
+    point: _Inside
+    best: Best
+    done: Int[Array, ""]
 
 
 def cones_of(
@@ -128,25 +137,26 @@ def within_cones(
     """
     first_close = precision(cones.constant.dtype).root
     unit = jnp.ones_like(cones.load)
-    none = jnp.zeros_like(cones.constant[:, 1:])
+    none = jnp.zeros_like(tangents_of(cones.constant))
     nan = 0 * jnp.sum(cones.constant)  # NaN where a rate is not finite
     middle = _Inside(unit + nan, unit, none, unit, none)
     slides = jnp.asarray(_SLIDES, unit.dtype)[attempt]
     close = jnp.where(attempt == 0, first_close, _CLOSER * tolerance)
     most = jnp.where(attempt < ATTEMPTS, _MOST, 0)
 
-    def iterate(
-        state: tuple[_Inside, Best, Int[Array, ""]],
-    ) -> tuple[_Inside, Best, Int[Array, ""]]:
-        """The next point, the best impulses so far, and the number of iterations."""
-        at = _corrected(cones, state[0], slides)
-        return at, better(misfit, state[1], _impulse(cones, at)), state[2] + 1
+    def iterate(now: _Iterate) -> _Iterate:
+        """The next point, and the best impulses so far."""
+        point = _corrected(cones, now.point, slides)
+        best = better(misfit, now.best, _impulse(cones, point))
+        return _Iterate(point, best, now.done + 1)
+
+    def goes_on(now: _Iterate) -> Bool[Array, ""]:
+        """True while the misfit is not close to 0, NaN too, and iterations are left."""
+        return ~(now.best.misfit <= close) & (now.done < most)
 
     first = Best(_impulse(cones, middle), jnp.asarray(jnp.inf, unit.dtype) + nan)
-    start = middle, first, jnp.asarray(0)
-    return while_loop(
-        lambda s: ~(s[1].misfit <= close) & (s[2] < most), iterate, start
-    )[1]
+    start = _Iterate(middle, first, jnp.asarray(0))
+    return while_loop(goes_on, iterate, start).best
 
 
 def better(
@@ -188,13 +198,13 @@ def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
     n = m * b
     mean = _mean(cones, at)
     change, matrix, right = _linearized(cones, at, slides)
-    moves = block_solve(matrix, right).reshape(n, 2)
+    constant_moves, aim_moves = block_solve(matrix, right).reshape(n, 2).T
 
     def ahead(aim: Float[Array, ""]) -> _Inside:
         """The next point, if all products shall be `aim`, as far as the cones allow."""
-        way = jnp.concatenate(
-            [moves[:, 0] + aim * moves[:, 1], jnp.stack([1.0 + 0 * aim, aim])]
-        )
+        coefficients = constant_moves + aim * aim_moves
+        factors = jnp.stack([1.0 + 0 * aim, aim])
+        way = jnp.concatenate([coefficients, factors])
         way = jax.tree.map(lambda form: jnp.tensordot(form, way, axes=1), change)
         room = jnp.minimum(_room_in_cone(cones, at, way), _room_of_normals(at, way))
         part = jnp.minimum(1.0, _WITHIN * room)
@@ -206,11 +216,10 @@ def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
         """The point ahead with this aim, and the aim that follows:
         `mean (mean+ / mean)^2`.
         """
-        point = ahead(state[1])
-        share = jnp.maximum(
-            jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM
-        )
-        return point, share * mean
+        _, aim = state
+        point = ahead(aim)
+        share = jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2
+        return point, jnp.maximum(share, _LEAST_AIM) * mean
 
     return fori_loop(0, 2, look, (at, jnp.zeros_like(mean)))[0]
 
@@ -245,8 +254,9 @@ def _linearized(
         """Sums `sum_i v_ji f_ji` over the tangents i of each contact j."""
         return jnp.sum(values[..., None] * forms, axis=1)
 
-    side = x[:, 1:]
-    slip = rates[:, 1:] + (missed[:, 1:] - at.slip)[..., None] * constant[None]
+    side = tangents_of(x)
+    gap = (tangents_of(missed) - at.slip)[..., None]
+    slip = tangents_of(rates) + gap * constant[None]
     product = aim - (at.push * at.normal)[:, None] * constant
     if cones.complementary:
         push = x[:, 0]

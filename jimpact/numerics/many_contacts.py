@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.numerics.discs import in_disc
+from jimpact.numerics.discs import in_disc, normals_of, tangents_of
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
 
@@ -142,9 +142,8 @@ def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
     """Scales of the impulses, 1 / sqrt of the diagonal; the tangents of a contact share
     one.
     """
-    squares = jnp.concatenate(
-        [diagonal[:, :1], jnp.mean(diagonal[:, 1:], axis=1, keepdims=True)], axis=1
-    )
+    of_tangents = jnp.mean(tangents_of(diagonal), axis=1, keepdims=True)
+    squares = jnp.concatenate([normals_of(diagonal), of_tangents], axis=1)
     squares = jnp.where(squares > 0, squares, 1.0)
     return 1 / jnp.sqrt(squares[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)])
 
@@ -155,9 +154,12 @@ def _projected(
     """Nearest impulses with `p >= 0`, then with `|p_t| <= slope (p + load)`, slope:
     scaled mu.
     """
-    p = jnp.maximum(x[:, :1], 0.0)
-    radius = slope[:, None] * (p if load is None else p + load[:, None])
-    return jnp.concatenate([p, in_disc(x[:, 1:, None], radius)[..., 0]], axis=1)
+    p = jnp.maximum(normals_of(x), 0.0)
+    pressed = p
+    if load is not None:
+        pressed = p + load[:, None]
+    side = in_disc(tangents_of(x)[..., None], slope[:, None] * pressed)
+    return jnp.concatenate([p, side[..., 0]], axis=1)
 
 
 def _with_momentum(

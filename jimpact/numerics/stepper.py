@@ -482,7 +482,7 @@ def _weighted(
     errors = []
     for slopes in tables:
         sums = jnp.tensordot(weights, value_of(slopes), axes=1)
-        change = sums[0]
+        change: Any = sums[0]
         if is_dual(slopes):
             tangents = jnp.tensordot(weights[0], slopes.tangents, axes=1)
             change = Dual(change, tangents)
