@@ -476,7 +476,11 @@ class _Problem:
         """
         own = self.flights[ok]
         starts = np.flatnonzero(np.diff(own, prepend=-1))
-        return self.errors.of(c, self.frames.t[self.rows[ok]], starts), own[starts]
+        rows = self.rows[ok]
+        relative = None
+        if self.frames.relative is not None:
+            relative = self.frames.relative[rows, c]
+        return self.errors.of(c, self.frames.t[rows], starts, relative), own[starts]
 
     def arc(self, ends: _Ends) -> np.ndarray:
         """Places (R, n) of all frames in flights.

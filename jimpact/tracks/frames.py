@@ -22,13 +22,15 @@ class Frames:
     """Times t (T,) [s], places q (T, n), NaN where lost, and their standard errors
     sigma (n,).
 
-    `angles`: coordinates that are angles; none where it is empty.
+    `angles`: coordinates that are angles; none where it is empty. `relative` (T, n):
+    errors of each frame in sigma; None: 1.
     """
 
     t: np.ndarray
     q: np.ndarray
     sigma: np.ndarray
     angles: tuple[bool, ...] = ()
+    relative: np.ndarray | None = None
 
     @property
     def step(self) -> float:
@@ -61,6 +63,10 @@ class Frames:
     def with_sigma(self, sigma: np.ndarray) -> "Frames":
         """The same frames with other standard errors."""
         return replace(self, sigma=sigma)
+
+    def with_relative(self, relative: np.ndarray) -> "Frames":
+        """The same frames with errors (T, n) of each in sigma."""
+        return replace(self, relative=relative)
 
     def with_places(self, q: np.ndarray) -> "Frames":
         """The same times with other places."""
