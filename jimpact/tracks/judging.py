@@ -40,6 +40,8 @@ LOOKED_AT = 400
 MOST_BODIES = 6
 ALTERNATING = 10.0
 
+NO_IMPACT = "No impact was found"  # how its finding begins
+
 
 def findings_of_input(
     q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]
@@ -222,7 +224,7 @@ def findings(
             rest = ""
         else:
             rest = ": one flight explains all frames within sigma"
-        found.insert(0, f"No impact was found{rest}.")
+        found.insert(0, f"{NO_IMPACT}{rest}.")
     return found
 
 

@@ -225,6 +225,5 @@ def _integrals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (scale * h**2).sum(axis=1) / z**2, (scale * rate**2).sum(axis=1)
 
 
-_DOMAIN = (0.0, SHORT)
-_PLACES = Chebyshev.interpolate(lambda z: _integrals(z)[0], DEGREE, _DOMAIN)
-_RATES = Chebyshev.interpolate(lambda z: _integrals(z)[1], DEGREE, _DOMAIN)
+_PLACES = Chebyshev.interpolate(lambda z: _integrals(z)[0], DEGREE, (0.0, SHORT))
+_RATES = Chebyshev.interpolate(lambda z: _integrals(z)[1], DEGREE, (0.0, SHORT))
