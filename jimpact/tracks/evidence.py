@@ -45,11 +45,12 @@ WAVED = (
     # none
     3.0
 )
-# Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
+# Least time of waves, in frames: shorter ones are white, as a period has 2 pi times. Ten
+# times more is a flight.
 LEAST_TIME = 5.0
-LEAST_MEANS = (
-    2.0  # of means of frames; ten times more would miss waves of half a flight
-)
+LONG_WAVES = 15.0  # frames of the first waves; of three times fewer they are bounces
+# Of means of frames; ten times more would miss waves of half a flight.
+LEAST_MEANS = 2.0
 # Share of the frames in flights that are not held from which on those that bend make
 # all bend. A tenth of it would free all flights of a body that slides at times.
 MOSTLY = 0.4
@@ -597,9 +598,9 @@ def largest_waves(
     None where no flight is long enough for them.
     """
     durations = [np.ptp(frames.t[some]) for some in flights]
-    if SHARES.max() * sum(durations) < LEAST_TIME * frames.step:
+    if SHARES.max() * sum(durations) < LONG_WAVES * frames.step:
         return Errors.white(frames.sigma)
-    time = max(WAVED * float(np.median(durations)), LEAST_TIME * frames.step)
+    time = max(WAVED * float(np.median(durations)), LONG_WAVES * frames.step)
     times = np.full(len(speeds), time)
     return Errors(frames.sigma, WAVE_SPEED * speeds * time, times)
 
