@@ -45,10 +45,13 @@ WAVED = (
     # none
     3.0
 )
-# Least time of waves, in frames: shorter ones are white, as a period has 2 pi times. Ten
-# times more is a flight.
+# Least time of waves, in frames: shorter ones are white, as a period has 2 pi times.
+# Ten times more is a flight.
 LEAST_TIME = 5.0
 LONG_WAVES = 15.0  # frames of the first waves; of three times fewer they are bounces
+# White errors of the start from few impacts where frames are few, in those of the start
+# from many. Ten times more would take bounces for errors, ten times less starts alike.
+COARSER = 4.0
 # Of means of frames; ten times more would miss waves of half a flight.
 LEAST_MEANS = 2.0
 # Share of the frames in flights that are not held from which on those that bend make
@@ -218,6 +221,17 @@ class Coordinate:
         else:
             more = 0.0
         return replace(self, rest=self.rest - more * self.curve), acceleration + more
+
+    def of_long_flights(self, least: int) -> tuple["Coordinate", np.ndarray]:
+        """The flights of so many frames or more, and which they are (F,)."""
+        long = self.counts >= least
+        rows = np.repeat(long, self.counts)
+        ends = np.cumsum(self.counts[long])
+        starts = np.concatenate([[0], ends[:-1]]).astype(int)
+        t, since, curve, rest = (
+            x[rows] for x in (self.t, self.since, self.curve, self.rest)
+        )
+        return Coordinate(t, since, curve, rest, starts, self.flights[long]), long
 
     def together(self, most: int) -> tuple["Coordinate", int]:
         """Means of so many frames in a row that `most` are left, and of how many each
@@ -455,8 +469,8 @@ class Likelihood:
         """True if means of 4, 16, 64, .. frames in a row are larger than white errors
         make them.
 
-        By SHOWN standard deviations of the sum of their squares; else waves are not
-        looked for.
+        By SHOWN standard deviations of the sum of their squares, in flights that have
+        four means or more; else waves are not looked for.
         """
         rest = self.some.rest
         if self.bent.any():
@@ -468,11 +482,14 @@ class Likelihood:
             rest = rest - np.repeat(share, self.some.counts) * curve
         some = replace(self.some, rest=rest)
         for frames in BINS:
-            few, taken = some.together(max(1, len(rest) // frames))
-            freedom = len(few.t) - self.values
-            if taken < frames or freedom <= 0:
+            enough, taken = some.of_long_flights(4 * frames)
+            if not taken.any():
                 break
-            square = float(few.rest @ few.rest) * taken / sigma**2
+            few, count = enough.together(max(1, len(enough.t) // frames))
+            freedom = len(few.t) - 2 * len(few.starts) - int(self.bent[taken].sum())
+            if count < frames or freedom <= 0:
+                break
+            square = float(few.rest @ few.rest) * count / sigma**2
             if square - freedom > SHOWN * np.sqrt(2 * freedom):
                 return True
         return False
@@ -560,7 +577,7 @@ class Likelihood:
         if self.sigma is not None:
             return self.at(best.wave / self.sigma, best.time)
         free = replace(self, sigma=None)
-        sigma = max(float(noise(self.some.rest[:, None])[0]), self.least)
+        sigma = max(float(noise(self.some.t, self.some.rest[:, None])[0]), self.least)
         for _ in range(TURNS):
             sigma = free.at(best.wave / sigma, best.time).sigma
         return replace(self, sigma=sigma).at(best.wave / sigma, best.time)
@@ -576,7 +593,8 @@ def judged(
     """The impacts among candidates, the ends of `flights`, and the errors of the
     places.
 
-    From two starts, no waves and the largest ones; what costs less is taken.
+    From two starts, no waves and the largest ones, or, of frames that are too few for
+    these, an unknown sigma that is COARSER; what costs less is taken.
     """
     speeds = frames.speeds(flights)
     task = _Task(frames, flights, estimated, speeds)
@@ -586,6 +604,9 @@ def judged(
         largest = largest_waves(frames, flights, speeds)
         if largest.waves.any():
             found.append(task.settled(largest, flight, found[0]))
+        elif estimated:
+            coarse = Errors.white(COARSER * errors.sigma)
+            found.append(task.settled(coarse, flight, found[0]))
     return _cheapest(frames, found)
 
 

@@ -118,7 +118,7 @@ def find_impacts(
     n = q.shape[1]
     raw = q
     q = _unwrapped(q, names)
-    rough = noise(q)
+    rough = noise(t, q)
     if sigma is None:
         given = rough
     else:

@@ -56,7 +56,7 @@ def with_turns(
         fitted = [
             fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)
         ]
-        notes = findings_of_noise(noise(turns_since_first(e)), given, first=4)
+        notes = findings_of_noise(noise(track.t, turns_since_first(e)), given, first=4)
     arcs, flights, covariance, p_values = _met(track, [flight for flight, _ in fitted])
     residual = np.full((len(e), 3), np.nan)
     for flight, some, measured in zip(flights, frames, turns):

@@ -60,7 +60,7 @@ def _parts_of(
         return []
     turns = turns_since_first(e)
     if sigma is None:
-        given = noise(turns)
+        given = noise(t, turns)
     else:
         given = sigma
     frames = Frames(t, turns, given, (True,) * 3)
