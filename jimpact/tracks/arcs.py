@@ -154,6 +154,16 @@ class Arcs:
                     gain[k, side, :, (K + 2) * size :] = common[end]
         return gain
 
+    def gain_with_places(self) -> np.ndarray:
+        """Derivatives (K, 3, n, N) of v-, v+ and the place of each impact."""
+        K = self.impacts
+        n = self.places.shape[1]
+        of_places = np.zeros((K, 1, n, len(self.covariance)))
+        for k in range(K):
+            own = (k + 1) * self.size
+            of_places[k, 0, :, own : own + n] = np.eye(n)
+        return np.concatenate([self.gain(), of_places], axis=1)
+
     def _end_slopes(self, i: int) -> np.ndarray:
         """Derivatives (2, n, W) of the velocities at both ends of flight i."""
         tau, places, own = self.ends(i)
@@ -194,6 +204,12 @@ class Arcs:
         `gain`.
         """
         flat = self.gain().reshape(-1, len(self.covariance))
+        return flat @ self.covariance @ flat.T
+
+    @property
+    def covariance_with_places(self) -> np.ndarray:
+        """Covariance (3nK, 3nK) of (v-, v+, place) of each impact in turn."""
+        flat = self.gain_with_places().reshape(-1, len(self.covariance))
         return flat @ self.covariance @ flat.T
 
     def jumps(self) -> np.ndarray:
@@ -253,8 +269,8 @@ class Start:
     Fields: frames of each flight; the model with first values; errors; `bent` (K + 1,
     n), true where a flight has an acceleration of its own beside that of the model; the
     duration of a contact, whose frames are left out [s]; first values of the instants
-    (K,), None: where arcs cross; instant_errors (K,): the instants are known, with
-    these standard errors, and stay.
+    (K,), None: where arcs cross; instant_errors (K,): instants are known, with these
+    standard errors, and stay, where they are not NaN.
     """
 
     flights: list[np.ndarray]
@@ -301,9 +317,12 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
     ends = _Ends(tau, places, np.zeros_like(places), start.flight)
     division = _Members(t, pool, start.contact, flights)
     problem = _Problem(frames, start.errors, start.bent, division.at(tau))
-    moving = start.instant_errors is None
+    known = start.instant_errors
+    if known is None:
+        known = np.full(len(instants), np.nan)
+    moving = np.isnan(known)
     for k in range(STEPS):
-        _, change = problem.step(ends, moving and k > 0)
+        _, change = problem.step(ends, moving & (k > 0))
         new = tau + change.tau
         room = LARGEST_MOVE * np.diff(tau)
         new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
@@ -312,15 +331,14 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
         tau = new
         model = ends.flight.moved(change.common)
         ends = _Ends(tau, ends.places + change.places, ends.own + change.own, model)
-        if k < SETTLING and moving:
+        if k < SETTLING and moving.any():
             problem = problem.with_members(division.at(tau))
         if k > 0 and moved <= SETTLED * frames.step:
             break
     normal, _ = problem.step(ends, moving)
     covariance = _inverse(normal)
-    if start.instant_errors is not None:
-        own = _rows_of_instants(*ends.places.shape)
-        covariance[own, own] = start.instant_errors**2
+    own = _rows_of_instants(*ends.places.shape)[~moving]
+    covariance[own, own] = known[~moving] ** 2
     covariance = _of_places(covariance, problem.drift(ends))
     residual = problem.residual(ends)
     return Arcs(*ends, start.errors, covariance, problem.members, residual, start.bent)
@@ -476,7 +494,11 @@ class _Problem:
         """
         own = self.flights[ok]
         starts = np.flatnonzero(np.diff(own, prepend=-1))
-        return self.errors.of(c, self.frames.t[self.rows[ok]], starts), own[starts]
+        rows = self.rows[ok]
+        relative = None
+        if self.frames.relative is not None:
+            relative = self.frames.relative[rows, c]
+        return self.errors.of(c, self.frames.t[rows], starts, relative), own[starts]
 
     def arc(self, ends: _Ends) -> np.ndarray:
         """Places (R, n) of all frames in flights.
@@ -560,12 +582,13 @@ class _Problem:
         starts = np.concatenate([[0], stops[:-1]])
         return [(i, slice(*rows)) for i, rows in enumerate(zip(starts, stops))]
 
-    def step(self, ends: _Ends, moving: bool) -> tuple[NormalMatrix, _Change]:
+    def step(self, ends: _Ends, moving: np.ndarray) -> tuple[NormalMatrix, _Change]:
         """Normal matrix at these values, and the Gauss-Newton step from them.
 
         Equation: `J^T C^-1 J step = J^T C^-1 r`, r = q - arc over frames that were
         seen, J the derivatives of the arcs, C the covariance of the errors. Instants
-        stay unless `moving`, those of the first and the last end always.
+        of impacts stay unless `moving` (K,), those of the first and the last end
+        always.
         """
         n = ends.places.shape[1]
         size = 2 * n + 1
@@ -592,7 +615,7 @@ class _Problem:
         return self._solved(grams, ends, moving)
 
     def _solved(
-        self, grams: np.ndarray, ends: _Ends, moving: bool
+        self, grams: np.ndarray, ends: _Ends, moving: np.ndarray
     ) -> tuple[NormalMatrix, _Change]:
         """Normal matrix and step from products (F, W, W) of slopes and residual in
         flights.
@@ -610,10 +633,7 @@ class _Problem:
         corner = grams[:, pair:-1, pair:-1].sum(axis=0)
         right_b = grams[:, pair:-1, -1].sum(axis=0)
         instants = np.arange(count) * size + n
-        if moving:
-            still = instants[[0, -1]]
-        else:
-            still = instants
+        still = instants[np.concatenate([[True], ~moving, [True]])]
         straight = np.ones((count, n), bool)
         straight[:-1] = ~self.bent
         end, coordinate = np.nonzero(straight)

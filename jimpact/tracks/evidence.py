@@ -45,10 +45,15 @@ WAVED = (
     # none
     3.0
 )
-# Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
-LEAST_TIME = 15.0
-# of means of frames; ten times more would miss waves of half a flight
-LEAST_MEANS = 4.0
+# Least time of waves, in frames: shorter ones are white, as a period has 2 pi times.
+# Ten times more is a flight.
+LEAST_TIME = 5.0
+LONG_WAVES = 15.0  # frames of the first waves; of three times fewer they are bounces
+# White errors of the start from few impacts where frames are few, in those of the start
+# from many. Ten times more would take bounces for errors, ten times less starts alike.
+COARSER = 4.0
+# Of means of frames; ten times more would miss waves of half a flight.
+LEAST_MEANS = 2.0
 # Share of the frames in flights that are not held from which on those that bend make
 # all bend. A tenth of it would free all flights of a body that slides at times.
 MOSTLY = 0.4
@@ -93,37 +98,64 @@ def price_of_bend(frames: int) -> float:
     return float(np.log(frames)) + LEAST_GAIN
 
 
-class FlightCosts:
-    """`r^T C^-1 r` and `log |C|` of flights, each by itself: on lines, on parabolas, on
-    the cheaper.
+class Costs(NamedTuple):
+    """`r^T C^-1 r + log |C|` (F,) of flights: on lines, on parabolas, on the cheaper.
 
-    A parabola of a coordinate has a price in the last. `flights` are lists of frames,
-    `acceleration` (n,) what is known of it.
+    A parabola of a coordinate has a price in the last.
     """
 
-    def __init__(
-        self,
-        frames: Frames,
-        flights: Sequence[np.ndarray],
-        flight: Flight,
-        errors: Errors,
-    ) -> None:
-        self.line = np.zeros(len(flights))
-        self.parabola = np.zeros(len(flights))
-        self.least = np.zeros(len(flights))
+    line: np.ndarray
+    parabola: np.ndarray
+    least: np.ndarray
+
+
+class FlightCosts:
+    """Costs of flights, each by itself, by a model and errors; each is computed once.
+
+    A flight is known by its first and last frame.
+    """
+
+    def __init__(self, frames: Frames, flight: Flight, errors: Errors) -> None:
+        self.frames = frames
+        self.flight = flight
+        self.errors = errors
+        self.known: dict[tuple[int, int], Costs] = {}
+
+    def of(self, flights: Sequence[np.ndarray]) -> Costs:
+        """Costs of these flights, lists of frames."""
+        names = [(int(some[0]), int(some[-1])) for some in flights]
+        new = {
+            name: some for name, some in zip(names, flights) if name not in self.known
+        }
+        if new:
+            found = self._computed(list(new.values()))
+            self.known |= {name: Costs(*x) for name, x in zip(new, zip(*found))}
+        return Costs(*np.array([self.known[name] for name in names]).reshape(-1, 3).T)
+
+    def of_pairs(self, flights: Sequence[np.ndarray]) -> Costs:
+        """Costs (F - 1,) of neighbouring flights as one."""
+        return self.of([np.concatenate(two) for two in pairwise(flights)])
+
+    def _computed(self, flights: Sequence[np.ndarray]) -> Costs:
+        """Costs of flights that are not known."""
+        frames = self.frames
+        line = np.zeros(len(flights))
+        parabola = np.zeros(len(flights))
+        least = np.zeros(len(flights))
         own = price_of_bend(len(frames.t))
         for c in range(frames.q.shape[1]):
-            some = Coordinate.of(frames, flights, flight, c)
+            some = Coordinate.of(frames, flights, self.flight, c)
             if not len(some.t):
                 continue
-            covariance = errors.of(c, some.t, some.starts)
+            covariance = self.errors.of(c, some.t, some.starts)
             grams = some.grams(covariance)
             log_det = covariance.log_det()
             straight = _rest(grams, 2) + log_det
             bent = _rest(grams, 3) + log_det
-            self.line[some.flights] += straight
-            self.parabola[some.flights] += bent
-            self.least[some.flights] += np.minimum(straight, bent + own)
+            line[some.flights] += straight
+            parabola[some.flights] += bent
+            least[some.flights] += np.minimum(straight, bent + own)
+        return Costs(line, parabola, least)
 
 
 @dataclass(frozen=True)
@@ -189,6 +221,17 @@ class Coordinate:
         else:
             more = 0.0
         return replace(self, rest=self.rest - more * self.curve), acceleration + more
+
+    def of_long_flights(self, least: int) -> tuple["Coordinate", np.ndarray]:
+        """The flights of so many frames or more, and which they are (F,)."""
+        long = self.counts >= least
+        rows = np.repeat(long, self.counts)
+        ends = np.cumsum(self.counts[long])
+        starts = np.concatenate([[0], ends[:-1]]).astype(int)
+        t, since, curve, rest = (
+            x[rows] for x in (self.t, self.since, self.curve, self.rest)
+        )
+        return Coordinate(t, since, curve, rest, starts, self.flights[long]), long
 
     def together(self, most: int) -> tuple["Coordinate", int]:
         """Means of so many frames in a row that `most` are left, and of how many each
@@ -307,7 +350,7 @@ def likely_errors(
     for kind in (angles, ~angles):
         if not (mostly & bent.any(axis=0))[kind].any():
             continue
-        for c in map(int, np.flatnonzero(kind & ~mostly)):
+        for c in map(int, np.flatnonzero(kind & ~bent.any(axis=0))):
             if c in likely:  # drag and spin bend all places, though one by little
                 curved = likely[c].some.counts > 3
                 found = replace(likely[c], bent=curved).most_likely(frames.step)
@@ -426,8 +469,8 @@ class Likelihood:
         """True if means of 4, 16, 64, .. frames in a row are larger than white errors
         make them.
 
-        By SHOWN standard deviations of the sum of their squares; else waves are not
-        looked for.
+        By SHOWN standard deviations of the sum of their squares, in flights that have
+        four means or more; else waves are not looked for.
         """
         rest = self.some.rest
         if self.bent.any():
@@ -439,11 +482,14 @@ class Likelihood:
             rest = rest - np.repeat(share, self.some.counts) * curve
         some = replace(self.some, rest=rest)
         for frames in BINS:
-            few, taken = some.together(max(1, len(rest) // frames))
-            freedom = len(few.t) - self.values
-            if taken < frames or freedom <= 0:
+            enough, taken = some.of_long_flights(4 * frames)
+            if not taken.any():
                 break
-            square = float(few.rest @ few.rest) * taken / sigma**2
+            few, count = enough.together(max(1, len(enough.t) // frames))
+            freedom = len(few.t) - 2 * len(few.starts) - int(self.bent[taken].sum())
+            if count < frames or freedom <= 0:
+                break
+            square = float(few.rest @ few.rest) * count / sigma**2
             if square - freedom > SHOWN * np.sqrt(2 * freedom):
                 return True
         return False
@@ -531,7 +577,7 @@ class Likelihood:
         if self.sigma is not None:
             return self.at(best.wave / self.sigma, best.time)
         free = replace(self, sigma=None)
-        sigma = max(float(noise(self.some.rest[:, None])[0]), self.least)
+        sigma = max(float(noise(self.some.t, self.some.rest[:, None])[0]), self.least)
         for _ in range(TURNS):
             sigma = free.at(best.wave / sigma, best.time).sigma
         return replace(self, sigma=sigma).at(best.wave / sigma, best.time)
@@ -547,7 +593,8 @@ def judged(
     """The impacts among candidates, the ends of `flights`, and the errors of the
     places.
 
-    From two starts, no waves and the largest ones; what costs less is taken.
+    From two starts, no waves and the largest ones, or, of frames that are too few for
+    these, an unknown sigma that is COARSER; what costs less is taken.
     """
     speeds = frames.speeds(flights)
     task = _Task(frames, flights, estimated, speeds)
@@ -557,6 +604,9 @@ def judged(
         largest = largest_waves(frames, flights, speeds)
         if largest.waves.any():
             found.append(task.settled(largest, flight, found[0]))
+        elif estimated:
+            coarse = Errors.white(COARSER * errors.sigma)
+            found.append(task.settled(coarse, flight, found[0]))
     return _cheapest(frames, found)
 
 
@@ -569,9 +619,9 @@ def largest_waves(
     None where no flight is long enough for them.
     """
     durations = [np.ptp(frames.t[some]) for some in flights]
-    if SHARES.max() * sum(durations) < LEAST_TIME * frames.step:
+    if SHARES.max() * sum(durations) < LONG_WAVES * frames.step:
         return Errors.white(frames.sigma)
-    time = max(WAVED * float(np.median(durations)), LEAST_TIME * frames.step)
+    time = max(WAVED * float(np.median(durations)), LONG_WAVES * frames.step)
     times = np.full(len(speeds), time)
     return Errors(frames.sigma, WAVE_SPEED * speeds * time, times)
 
@@ -633,7 +683,7 @@ class _Task:
 
 def _cost(frames: Frames, verdict: Verdict) -> float:
     """Cost of all flights: of residuals, prices of flights and of waves."""
-    costs = FlightCosts(frames, verdict.flights, verdict.flight, verdict.errors)
+    costs = FlightCosts(frames, verdict.flight, verdict.errors).of(verdict.flights)
     waves = 2 * np.log(len(frames.t)) + LEAST_SAVED
     of_waves = waves * np.count_nonzero(verdict.errors.waves)
     least = np.minimum(costs.line, costs.parabola)
@@ -651,9 +701,10 @@ def _joined(
     flights = list(flights)
     start = price(*frames.q.shape)
     counts = {"errors": 0, "bends": 0}
+    costs = FlightCosts(frames, flight, errors)
     while len(flights) > 1:
-        alone = FlightCosts(frames, flights, flight, errors)
-        both = _of_pairs(frames, flights, flight, errors)
+        alone = costs.of(flights)
+        both = costs.of_pairs(flights)
         two = alone.least[:-1] + alone.least[1:]
         by_line = both.line - two - start
         by_bend = both.least - two + LEAST_GAIN
@@ -674,25 +725,6 @@ def _joined(
     return Verdict(flights, flight, errors, straight, counts["errors"], counts["bends"])
 
 
-def _of_pairs(
-    frames: Frames, flights: list[np.ndarray], flight: Flight, errors: Errors
-) -> FlightCosts:
-    """Costs (F - 1,) of neighbouring flights as one."""
-    pairs = [np.concatenate(two) for two in pairwise(flights)]
-    costs = [
-        FlightCosts(frames, some, flight, errors)
-        for some in (pairs[::2], pairs[1::2])
-        if some
-    ]
-    whole = costs[0]
-    for name in ("line", "parabola", "least"):
-        values = np.zeros(len(pairs))
-        for first, some in enumerate(costs):
-            values[first::2] = getattr(some, name)
-        setattr(whole, name, values)
-    return whole
-
-
 def doubtful(
     frames: Frames, flights: Sequence[np.ndarray], flight: Flight, errors: Errors
 ) -> np.ndarray:
@@ -701,9 +733,9 @@ def doubtful(
     """
     if len(flights) < 2:
         return np.zeros(0, bool)
-    flights = list(flights)
-    alone = FlightCosts(frames, flights, flight, errors)
-    both = _of_pairs(frames, flights, flight, errors)
+    costs = FlightCosts(frames, flight, errors)
+    alone = costs.of(flights)
+    both = costs.of_pairs(flights)
     extra = frames.q.shape[1]  # values that lines which do not meet have more
     two = alone.least[:-1] + alone.least[1:]
     return both.least < two + LEAST_GAIN + extra

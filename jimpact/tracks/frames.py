@@ -22,13 +22,15 @@ class Frames:
     """Times t (T,) [s], places q (T, n), NaN where lost, and their standard errors
     sigma (n,).
 
-    `angles`: coordinates that are angles; none where it is empty.
+    `angles`: coordinates that are angles; none where it is empty. `relative` (T, n):
+    errors of each frame in sigma; None: 1.
     """
 
     t: np.ndarray
     q: np.ndarray
     sigma: np.ndarray
     angles: tuple[bool, ...] = ()
+    relative: np.ndarray | None = None
 
     @property
     def step(self) -> float:
@@ -62,20 +64,45 @@ class Frames:
         """The same frames with other standard errors."""
         return replace(self, sigma=sigma)
 
+    def with_relative(self, relative: np.ndarray) -> "Frames":
+        """The same frames with errors (T, n) of each in sigma."""
+        return replace(self, relative=relative)
+
     def with_places(self, q: np.ndarray) -> "Frames":
         """The same times with other places."""
         return replace(self, q=q)
 
 
-def noise(q: np.ndarray) -> np.ndarray:
-    """Standard errors (n,) of places (T, n), from their third differences.
+def noise(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Standard errors (n,) of places (T, n) at times (T,), from four frames in a row.
 
-    They vanish for a constant acceleration; the median of their sizes, times 1.4826
-    (normal errors), does not see the few at impacts. The variance of a third difference
-    is 20 sigma^2.
+    A third divided difference `sum w_j q_j`, `w_j = prod_k 1 / (t_j - t_k)`, vanishes
+    for a constant acceleration at any times; so an error of a time counts, too. Sizes
+    are in `|w|`; their median, times 1.4826 (normal errors), does not see the few at
+    impacts. Of frames that were seen where no four in a row were.
     """
-    sizes = np.array([median(np.abs(differences(x, 3))) for x in q.T])
-    return np.maximum(1.4826 * sizes / np.sqrt(20), least_noise(q))
+    sizes = np.zeros(q.shape[1])
+    for c, x in enumerate(q.T):
+        found = divided_differences(t, x)
+        if not found.size:
+            seen = np.isfinite(x)
+            found = divided_differences(t[seen], x[seen])
+        sizes[c] = median(np.abs(found))
+    return np.maximum(1.4826 * sizes, least_noise(q))
+
+
+def divided_differences(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Third divided differences of places (T,) at times (T,), of unit variance for unit
+    errors, without those that are NaN.
+    """
+    windows = max(len(x) - 3, 0)
+    rows = np.arange(windows)[:, None] + np.arange(4)
+    gaps = t[rows][:, :, None] - t[rows][:, None]
+    gaps[:, np.arange(4), np.arange(4)] = 1.0
+    weights = 1 / gaps.prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    found = (weights * x[rows]).sum(axis=1)
+    return found[np.isfinite(found)]
 
 
 def least_noise(q: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.flight import Flight, Force
 from jimpact.tracks.frames import Frames, noise
 from jimpact.tracks.judging import (
+    NO_IMPACT,
     findings,
     findings_of_bodies,
     findings_of_doubts,
@@ -25,6 +26,7 @@ from jimpact.tracks.poses import with_turns
 from jimpact.tracks.quaternions import as_inertia, as_poses
 from jimpact.tracks.search import Settings, doubts, fitted_arcs, searched, windowed
 from jimpact.tracks.track import Track, TrackImpact
+from jimpact.tracks.turning_alone import with_impacts_of_turning
 
 VELOCITY_OF = {"m": LINEAR, "rad": ANGULAR}
 
@@ -77,7 +79,8 @@ def find_impacts(
         quaternion: 'wxyz' or 'xyzw', the order in which poses hold it; then q is (T,
             7), the centre of mass and a unit quaternion of either sign, from the axes
             of the body to those of space. sigma has (6,), places and turns about the
-            axes of the body [rad], acceleration (3,). Impacts are found by the places.
+            axes of the body [rad], acceleration (3,). Impacts are found by the
+            places, and of a body as a sphere by the turns, too.
         inertia: of a body with poses, (3,) along its axes or (3, 3), about the centre
             of mass, up to a factor: between impacts it turns freely. None: as a sphere
             or a cube does.
@@ -115,7 +118,7 @@ def find_impacts(
     n = q.shape[1]
     raw = q
     q = _unwrapped(q, names)
-    rough = noise(q)
+    rough = noise(t, q)
     if sigma is None:
         given = rough
     else:
@@ -232,9 +235,26 @@ def _in_poses(
         of_places = both[:3]
         of_turns = both[3:]
     track = find_impacts(t, places, of_places, acceleration=acceleration, **options)
+    if moments is None:
+        track = _with_turning_alone(track, e, of_turns, options["shortest"])
     return replace(
         with_turns(track, e, of_turns, moments), order=quaternion, inertia=moments
     )
+
+
+def _with_turning_alone(
+    track: Track, e: np.ndarray, sigma: np.ndarray | None, shortest: int
+) -> Track:
+    """Track of places, with impacts that orientations e (T, 4) alone show."""
+    frames = Frames(track.t - track.t.mean(), track.q, track.sigma)
+    arcs, alone = with_impacts_of_turning(track.arcs, frames, e, sigma, shortest)
+    if not alone.any():
+        return track
+    doubtful = np.zeros(len(alone), bool)
+    doubtful[~alone] = [impact.doubtful for impact in track.impacts]
+    found = _as_track(track.t, track.q, arcs, ("m",) * 3, doubtful)
+    notes = [note for note in track.warnings if not note.startswith(NO_IMPACT)]
+    return replace(found, warnings=tuple(notes), candidates=track.candidates)
 
 
 def _checked(
@@ -367,4 +387,5 @@ def _as_track(
         t,
         q,
         arcs,
+        covariance_with_poses=arcs.covariance_with_places,
     )

@@ -56,7 +56,7 @@ def with_turns(
         fitted = [
             fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)
         ]
-        notes = findings_of_noise(noise(turns_since_first(e)), given, first=4)
+        notes = findings_of_noise(noise(track.t, turns_since_first(e)), given, first=4)
     arcs, flights, covariance, p_values = _met(track, [flight for flight, _ in fitted])
     residual = np.full((len(e), 3), np.nan)
     for flight, some, measured in zip(flights, frames, turns):
@@ -151,14 +151,15 @@ def _with_velocities(
 ) -> Track:
     """Track whose impacts have velocities (x', omega) of these arcs and rotations.
 
-    Equation: covariance `G C G^T` of (v-, v+) of all impacts, G the derivatives in the
-    values of arcs and flights; `covariance` is C. An instant moves omega by omega'.
+    Equation: covariance `G C G^T` of (v-, v+, pose) of all impacts, G the derivatives
+    in the values of arcs and flights; `covariance` is C. An instant moves omega by
+    omega', and the orientation by omega, turns about the axes of the body.
     """
     free = len(arcs.covariance)
     before, after = arcs.velocities()
     impacts = len(before)
-    gain = np.zeros((impacts, 2, 6, len(covariance)))
-    gain[:, :, :3, :free] = arcs.gain()
+    gain = np.zeros((impacts, 3, 6, len(covariance)))
+    gain[:, :, :3, :free] = arcs.gain_with_places()
     rows = arcs.rows_of_instants()
     times = arcs.instants[1:-1] + track.t.mean()
     poses = []
@@ -172,10 +173,14 @@ def _with_velocities(
             gain[k, side, 3:, first : first + 6] = at.omega_slopes[0]
             gain[k, side, 3:, rows[k]] = flight.rate(at.omega[0])
             if side == 0:
+                gain[k, -1, 3:, first : first + 6] = at.turn_slopes[0]
+                gain[k, -1, 3:, rows[k]] = at.omega[0]
                 quaternion = at.turn[0].as_quat(scalar_first=True)
                 poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
-    flat = gain.reshape(12 * impacts, len(covariance))
-    whole = flat @ covariance @ flat.T
+    flat = gain.reshape(18 * impacts, len(covariance))
+    with_poses = flat @ covariance @ flat.T
+    velocities = np.arange(18 * impacts).reshape(impacts, 18)[:, :12].ravel()
+    whole = with_poses[np.ix_(velocities, velocities)]
     found = []
     for k, (instant, pose) in enumerate(zip(times, poses)):
         own = slice(12 * k, 12 * (k + 1))
@@ -185,4 +190,10 @@ def _with_velocities(
         found.append(
             TrackImpact(float(instant), error, pose, pre, post, whole[own, own], doubt)
         )
-    return replace(track, impacts=tuple(found), covariance=whole, arcs=arcs)
+    return replace(
+        track,
+        impacts=tuple(found),
+        covariance=whole,
+        arcs=arcs,
+        covariance_with_poses=with_poses,
+    )

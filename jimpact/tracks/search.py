@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jimpact.tracks.arcs import Arcs, Start, crossings, fit_arcs
+from jimpact.tracks.clock import with_clock
 from jimpact.tracks.division import SMALLEST_JUMP, divided
 from jimpact.tracks.evidence import Verdict, doubtful, judged
 from jimpact.tracks.flight import Flight
@@ -31,6 +32,12 @@ BEYOND_SIGMA = 3.3
 # waves, as a share of the time of the waves. Ten times more are waves themselves.
 LOCAL = 0.1
 FEWEST_LOCAL = 4
+# Share of the windows by which a first acceleration is found. Three times more would
+# take windows with an impact, a third of it would leave few.
+BEST_WINDOWS = 0.25
+# Residuals of arcs that meet, in errors of the flights alone, from which on one flight
+# is none. Ten times more would pass arcs that miss one another.
+UNMET = 2.0
 MOST_STRIDES = 32  # parts of the track that windows of the first acceleration are
 
 
@@ -97,14 +104,14 @@ class Search:
 def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
     """The model with a first value of an unknown acceleration.
 
-    Of two values, by windows of frames of two lengths, that by which a division costs
-    less.
+    Of three values, by windows of frames of three lengths, that by which a division
+    costs less.
     """
     if not flight.unknown.any():
         return flight
     stride = min(max(1, round(len(frames.t) / MOST_STRIDES)), shortest)
     tried = []
-    for k in {stride, max(1, stride // 2)}:
+    for k in {max(1, stride // 2), stride, 2 * stride}:
         found = np.array([curvature(frames.t, x, k) for x in frames.q.T])
         tried.append(np.where(flight.unknown, found, flight.acceleration))
     if len(tried) > 1:
@@ -116,7 +123,8 @@ def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
     """Median acceleration of parabolas through five frames in a row that are `stride`
     apart.
 
-    Of frames that were seen; 0 of too few.
+    Of frames that were seen, and of the quarter of windows that lie on their parabolas
+    best, as many of the others have an impact in them; 0 of too few frames.
     """
     seen = np.isfinite(x)
     t = t[seen]
@@ -131,7 +139,11 @@ def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
     slope = (curve * since).sum(axis=1) / (since**2).sum(axis=1)
     curve = curve - slope[:, None] * since
     found = (curve * x[rows]).sum(axis=1) / (curve**2).sum(axis=1)
-    return median(found)
+    rest = x[rows] - x[rows].mean(axis=1, keepdims=True)
+    rate = (rest * since).sum(axis=1) / (since**2).sum(axis=1)
+    rest = rest - rate[:, None] * since - found[:, None] * curve
+    square = (rest**2).sum(axis=1)
+    return median(found[square <= np.quantile(square, BEST_WINDOWS)])
 
 
 def searched(frames: Frames, flight: Flight, settings: Settings) -> Search:
@@ -199,37 +211,83 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
 
 
 def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
-    """Arcs of the flights of a search, and these; those without a jump of SMALLEST_JUMP
-    joined.
+    """Arcs of the flights of a search, and these, joined where arcs show no impact.
+
+    1. Fit the arcs; first at fixed instants, as nothing determines one without a jump.
+    2. Join two flights without a jump of SMALLEST_JUMP, or as `_without_false` says;
+       fit again.
+    3. Take the errors of the residuals, where they are unknown or clearly larger, and
+       those of times, where residuals grow with the speed; fit again.
     """
     verdict = search.verdict
     contact = search.settings.contact
     start = Start(
         verdict.flights, verdict.flight, verdict.errors, verdict.bent, contact
     )
-    moving = False  # first at fixed instants, as nothing determines one without a jump
+    moving = False
     while True:
         arcs = _arcs(search.frames, start, moving)
         jumps = arcs.jumps()
-        if not jumps.size or jumps.min() >= SMALLEST_JUMP:
-            if moving or not jumps.size:
-                break
+        if jumps.size and jumps.min() < SMALLEST_JUMP:
+            start = start.joined_at(int(np.argmin(jumps)))
+            continue
+        if jumps.size and not moving:
             moving = True
             continue
-        start = start.joined_at(int(np.argmin(jumps)))
+        joined = _without_false(search, arcs, start)
+        if joined is None:
+            break
+        start = joined
     sigma = of_residuals(arcs, search.frames)
-    larger = sigma > start.errors.sigma * (
+    given = start.errors.sigma
+    larger = of_most_flights(arcs) > given * (
         1 + BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs))
     )
     if search.settings.estimated or larger.any():
         if not search.settings.estimated:
-            sigma = np.where(larger, sigma, start.errors.sigma)
-        errors = replace(start.errors, sigma=sigma)
+            sigma = np.where(larger, sigma, given)
+        frames, clock = with_clock(arcs, search.frames)
+        errors = replace(start.errors, sigma=sigma, clock=clock)
         again = replace(
             start, errors=errors, flight=arcs.flight, instants=arcs.instants[1:-1]
         )
-        arcs = _arcs(search.frames, again)
+        arcs = _arcs(frames, again)
     return arcs, start.flights
+
+
+def _without_false(search: Search, arcs: Arcs, start: Start) -> Start | None:
+    """The start with a flight that is none joined to a neighbour; None: all are.
+
+    A flight between two impacts whose instants leave it fewer frames than a flight has,
+    by more than one at each end. And where residuals are UNMET times the errors that
+    flights alone have, that with the largest ones, if residuals are smaller without it:
+    its arc misses others.
+    """
+    if not arcs.impacts:
+        return None
+    t = search.frames.t
+    enough = max(search.settings.shortest - 2, 2)
+    for i, some in enumerate(arcs.members[1:-1], 1):
+        first, last = arcs.instants[i : i + 2]
+        if ((t[some] >= first) & (t[some] <= last)).sum() < enough:
+            return _joined_best(search.frames, start, i)[1]
+    if (of_residuals(arcs, search.frames) > UNMET * arcs.errors.sigma).any():
+        sizes = [np.nanmean(arcs.residual[some] ** 2) for some in arcs.members]
+        square, joined = _joined_best(search.frames, start, int(np.argmax(sizes)))
+        if square < np.nansum(arcs.residual**2):
+            return joined
+    return None
+
+
+def _joined_best(frames: Frames, start: Start, flight: int) -> tuple[float, Start]:
+    """chi^2 of all arcs, and a flight joined to the neighbour that makes it least."""
+    tried = []
+    for k in (flight - 1, flight):
+        if 0 <= k < len(start.flights) - 1:
+            joined = start.joined_at(k)
+            tried.append((float(np.nansum(_arcs(frames, joined).residual ** 2)), k))
+    square, k = min(tried)
+    return square, start.joined_at(k)
 
 
 def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
@@ -290,16 +348,35 @@ def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
 
 
 def of_residuals(arcs: Arcs, frames: Frames) -> np.ndarray:
-    """Standard errors (n,): `sigma sqrt(chi^2 / freedom)` of residuals of coordinates
-    without waves.
+    """Standard errors (n,) of residuals of coordinates without waves.
+
+    Equation: `sigma^2 chi^2 / (freedom - 2)`, the mean of the square of sigma where all
+    its logarithms were as likely before: of few frames sigma itself errs, and errors
+    that are normal with this sigma scatter by 1. Of four degrees of freedom or fewer
+    chi^2 / 2.
 
     Freedom: frames, less K + 2 places, 1/n of K instants, accelerations that were
     found.
     """
     sigma = arcs.errors.sigma
-    scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / _freedom(arcs))
+    freedom = np.maximum(_freedom(arcs) - 2, 2.0)
+    scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
     found = np.maximum(sigma * scale, least_noise(frames.q))
     return np.where(arcs.errors.waves > 0, sigma, found)
+
+
+def of_most_flights(arcs: Arcs) -> np.ndarray:
+    """Standard errors (n,) that residuals exceed in flights of half of all frames.
+
+    A body that slides between flights leaves large residuals there, but not in the
+    others.
+    """
+    sizes = np.array(
+        [np.nanmean(arcs.residual[some] ** 2, axis=0) for some in arcs.members]
+    )
+    counts = [len(some) for some in arcs.members]
+    by_frame = np.repeat(sizes, counts, axis=0)
+    return arcs.errors.sigma * np.sqrt(np.nanmedian(by_frame, axis=0))
 
 
 def _freedom(arcs: Arcs) -> np.ndarray:

@@ -6,26 +6,19 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from jimpact.bodies.base import Body
 from jimpact.core.scene import Scene, dense_mass
 from jimpact.shots.covariances import covariance_of
-from jimpact.shots.data import ROUNDING, Experiments
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.frames import Frames
 from jimpact.tracks.held import held_flights
+from jimpact.tracks.pushes import Pushes, slopes_in_pose
 from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
 
-# A jump of velocities lies in the cone of a scene's impulses up to so many standard
-# errors. Ten times more would pass impacts with something else than the contacts.
-OUT_OF_CONE = 5.0
-# ... or up to this share of the jump, by kinetic energy: bodies and calibrations differ
-# from their model. Ten times more is all of it; ten times less drops most measured
-# impacts of a square.
-SHARE_OUT = 0.2
 # Share of the trace by which moments of inertia may differ from those of the body of a
 # scene. Ten times more is a tenth: flights would turn otherwise by degrees.
 INERTIA_WITHIN = 0.01
@@ -48,6 +41,10 @@ class TrackImpact:
     post: np.ndarray
     covariance: np.ndarray
     doubtful: bool = False
+
+    def can_be_of(self, scene: Scene) -> bool:
+        """True if the contacts of a scene can have made it, see `Pushes.can_make`."""
+        return Pushes.of(scene).can_make(self.pre, self.post, self.covariance)
 
     def not_in(self, order: str) -> "TrackImpact":
         """Impact as if the quaternions of the file stood in the other order than
@@ -76,7 +73,8 @@ class Track:
     scalar first, whatever the `order` of the file; residuals and sigma are those of
     places and of turns about the axes of the body, and `inertia` is as given, None as
     of a sphere. `candidates` say how many impacts there is no evidence for, and why;
-    `name` is the label of its shots.
+    `name` is the label of its shots. `covariance_with_poses` (3nK, 3nK) is that of (v-,
+    v+, pose) of all impacts, turns of a pose about the axes of the body.
     """
 
     impacts: tuple[TrackImpact, ...]
@@ -92,6 +90,9 @@ class Track:
     inertia: np.ndarray | None = None
     candidates: tuple[str, ...] = ()
     name: str = ""
+    covariance_with_poses: np.ndarray = field(
+        default_factory=lambda: np.zeros((0, 0)), repr=False
+    )
 
     @property
     def residual(self) -> np.ndarray:
@@ -176,10 +177,9 @@ class Track:
         velocities towards its right end: of bodies that move the other way round,
         mirror the track (-q, and the bodies in reverse).
 
-        The scene of a pose counts as known: the covariance has no errors of
-        orientations. Where an angle's error is not small beside the relative errors of
-        velocities (many frames a flight), a fit shows them as lack of fit, and its
-        errors of friction are too small.
+        Errors of a body's pose turn the lever arms of its contacts. The covariance of
+        v+ has what they do to velocities after an impact with impulses in the measured
+        ratios and with the measured restitution, at the same v-.
 
         Args:
             scene: of all impacts; a body, which each pose places; None: `fit` is given
@@ -203,6 +203,7 @@ class Track:
         certain = np.array([doubtful or not each.doubtful for each in self.impacts])
         kept = np.flatnonzero(certain)
         scenes = None
+        covariance = self.covariance
         if not kept.size:
             raise ValueError(
                 f"All of {counted(len(self.impacts), 'impact')} of the track are "
@@ -234,6 +235,8 @@ class Track:
                     "free."
                 )
             scenes = [at[k] for k in kept]
+            if isinstance(scene, Body):
+                covariance = self._with_errors_of_poses(scene, near, kept)
         n = len(self.units)
         if label is None:
             name = self.name
@@ -246,11 +249,29 @@ class Track:
         return Experiments(
             [self.impacts[k].pre for k in kept],
             [self.impacts[k].post for k in kept],
-            covariance=covariance_of(self.covariance, kept, n),
+            covariance=covariance_of(covariance, kept, n),
             scenes=scenes,  # type: ignore[arg-type]
             shots=[f"{before}{k + 1}" for k in kept],
             units=self.units,
         )
+
+    def _with_errors_of_poses(
+        self, body: Body, near: float, kept: np.ndarray
+    ) -> np.ndarray:
+        """Covariance (2nK, 2nK) of (v-, v+ - F q) of all impacts, F of
+        `slopes_in_pose` of those that are `kept`, q the error of the pose.
+        """
+        n = len(self.units)
+        count = len(self.impacts)
+        gain = np.zeros((count, 2 * n, count, 3 * n))
+        for k in range(count):
+            gain[k, :, k, : 2 * n] = np.eye(2 * n)
+        for k in kept:
+            impact = self.impacts[k]
+            slopes = slopes_in_pose(body, impact.q, near, impact.pre, impact.post)
+            gain[k, n:, k, 2 * n :] = -slopes
+        flat = gain.reshape(2 * n * count, 3 * n * count)
+        return flat @ self.covariance_with_poses @ flat.T
 
     def _between_free_flights(self) -> np.ndarray:
         """True (K,) for impacts before and after which the body is free, not held."""
@@ -310,7 +331,7 @@ class Track:
 def _scenes_of(
     place: Scene | Body, impacts: Sequence[TrackImpact], near: float
 ) -> list[Scene | None]:
-    """Scene of each impact; None where no gap is within `near` [m], or by `_can_be_of`.
+    """Scene of each impact; None where no gap is within `near` [m], or by `can_be_of`.
 
     `place`: a scene of all impacts, or a body, which each pose places.
     """
@@ -322,43 +343,7 @@ def _scenes_of(
         for k, pose in enumerate(poses):
             if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
                 scenes[k] = None
-    return [
-        s if s is not None and _can_be_of(s, i) else None
-        for s, i in zip(scenes, impacts)
-    ]
-
-
-def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:
-    """True if a contact approaches, and contacts that push can have made the jump of
-    velocities.
-
-    Equation: bounded least squares `|A (M^-1 [N, H, C] p - (v+ - v-))|`, normal p >= 0,
-    within OUT_OF_CONE in units of the errors of the jump, or within SHARE_OUT of the
-    jump by energy.
-    """
-    normals = np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
-    speeds = np.abs(normals).T @ np.abs(impact.pre)
-    if not (normals.T @ impact.pre < -ROUNDING * speeds).any():
-        return False
-    columns = [normals]
-    low = [np.zeros(normals.shape[1])]
-    for other in (scene.tangents, scene.constraints):
-        if other is not None:
-            columns.append(np.asarray(other, float))
-            low.append(np.full(columns[-1].shape[1], -np.inf))
-    mass = np.asarray(dense_mass(scene), float)
-    moves = np.linalg.solve(mass, np.hstack(columns))
-    n = len(impact.pre)
-    signs = np.hstack([-np.eye(n), np.eye(n)])
-    errors = np.linalg.inv(np.linalg.cholesky(signs @ impact.covariance @ signs.T))
-    energy = np.linalg.cholesky(mass).T
-    limits = np.concatenate(low)
-    limit = SHARE_OUT * np.linalg.norm(energy @ (impact.post - impact.pre))
-    for metric, allowed in ((errors, OUT_OF_CONE), (energy, limit)):
-        jump = metric @ (impact.post - impact.pre)
-        rest = lsq_linear(
-            metric @ moves, jump, (limits, np.full(len(limits), np.inf)), "bvls"
-        )
-        if 2 * rest.cost <= allowed**2:
-            return True
-    return False
+    for k, (at, impact) in enumerate(zip(scenes, impacts)):
+        if at is not None and not impact.can_be_of(at):
+            scenes[k] = None
+    return scenes

@@ -6,7 +6,7 @@ import pytest
 import jimpact as ji
 from jimpact.tracks.division import divided
 from jimpact.tracks.frames import Frames, rounding_step
-from jimpact.tracks.waves import Errors
+from jimpact.tracks.waves import DAMPING, Errors
 
 G = 9.80665
 SPEED = np.sqrt(2 * G * 0.4)
@@ -38,17 +38,21 @@ def errors(impact, before, after):
     return apart / np.sqrt(np.diag(impact.covariance))
 
 
-def test_the_covariance_of_waves_is_that_of_its_equation():
+@pytest.mark.parametrize("time", [0.02, 0.2, 1.0])
+def test_the_covariance_of_waves_is_that_of_its_equation(time):
     rng = np.random.default_rng(0)
     t = np.sort(rng.random(20))
     starts = np.array([0, 8])
-    covariance = Errors(np.array([0.1]), np.array([0.7]), np.array([0.2])).of(
-        0, t, starts
-    )
-    dense = 0.01 * np.eye(20)
+    relative = rng.uniform(0.5, 2, 20)
+    errors = Errors(np.array([0.1]), np.array([0.7]), np.array([time]))
+    covariance = errors.of(0, t, starts, relative)
+    dense = 0.01 * np.diag(relative**2)
+    b = DAMPING
+    c = np.sqrt(1 - b**2)
     for some in (slice(0, 8), slice(8, 20)):
-        x = np.abs(t[some, None] - t[some]) / 0.2
-        dense[some, some] += 0.49 * (1 + x) * np.exp(-x)
+        x = np.abs(t[some, None] - t[some]) / time
+        wave = np.exp(-b * x) * (np.cos(c * x) + b / c * np.sin(c * x))
+        dense[some, some] += 0.49 * wave
     columns = rng.normal(size=(20, 3))
     np.testing.assert_allclose(
         covariance.solve(columns), np.linalg.solve(dense, columns), rtol=1e-5, atol=1e-5
@@ -119,6 +123,61 @@ def test_a_clock_that_errs_loses_no_impact():
         np.testing.assert_allclose(
             [x.time for x in track.impacts], instants[1:-1], atol=0.01
         )
+
+
+def test_errors_of_times_are_found_and_weigh_fast_frames_less():
+    """Errors of velocities are those stated, and the report says by how much times err."""
+    rng = np.random.default_rng(21)
+    apart = []
+    found = []
+    for _ in range(30):
+        t, y = bounce(rng, noise=5e-4)
+        track = ji.tracks.find_impacts(
+            t + 8e-4 * rng.normal(size=t.size), y, acceleration=-G
+        )
+        (impact,) = track.impacts
+        apart.append(errors(impact, [-SPEED], [0.7 * SPEED]))
+        found.append(track.arcs.errors.clock)
+    assert 0.7 < np.sqrt(np.mean(np.square(apart))) < 1.3
+    assert np.median(found) == pytest.approx(8e-4, rel=0.2)
+    assert "grow with the speed" in " ".join(track.warnings)
+    t, y = bounce(rng, noise=5e-4)
+    assert ji.tracks.find_impacts(t, y, acceleration=-G).arcs.errors.clock == 0
+
+
+def test_errors_before_a_lens_are_nearly_those_stated():
+    rng = np.random.default_rng(22)
+    apart = []
+    for _ in range(8):
+        t, q = gliders(rng, slope=0.02, waves=1.5e-4)
+        (impact,) = ji.tracks.find_impacts(t, q).impacts
+        assert len(impact.pre) == 2
+        apart.append(np.sqrt(np.diag(impact.covariance)))
+    assert np.max(apart) < 2e-3
+
+
+def test_few_frames_of_an_unknown_gravity_scatter_as_stated():
+    """Sigma of 18 degrees of freedom errs itself: errors hold that."""
+    rng = np.random.default_rng(23)
+    apart = []
+    for _ in range(100):
+        t, y = bounce(rng, 30)
+        (impact,) = ji.tracks.find_impacts(t, y, acceleration=None).impacts
+        apart.append(errors(impact, [-SPEED], [0.7 * SPEED]))
+    assert 0.85 < np.sqrt(np.mean(np.square(apart))) < 1.15
+
+
+def test_a_given_sigma_stays_where_most_flights_agree():
+    """A body that is pushed in one of five flights has the given errors in the others."""
+    rng = np.random.default_rng(24)
+    t = np.arange(250) / 250
+    instants = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
+    q = np.interp(t, instants, [0, 0.2, 0.05, 0.3, 0.1, 0.4])
+    pushed = (t > 0.4) & (t < 0.6)
+    q = q + np.where(pushed, 2e-3 * np.sin(60 * t), 0) + 1e-4 * rng.normal(size=t.size)
+    track = ji.tracks.find_impacts(t, q, 1e-4)
+    assert track.sigma[0] == 1e-4
+    assert track.warnings
 
 
 def test_coordinates_without_noise_and_in_pixels():

@@ -1,5 +1,6 @@
 """Poses of a body in space: impacts, angular velocities in its axes, orders of quaternions."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -270,3 +271,83 @@ def test_a_study_of_poses(tmp_path):
             ji.read_study(path)
     path.write_text(study.replace('"xyzw"', '"xyzw"\n    drag = "unknown"'))
     assert abs(ji.read_study(path).track.drag) < 1.0
+
+
+def test_impacts_that_change_the_turning_alone_are_found():
+    """A ball in flight whose spin alone jumps; without a jump none is found."""
+    rng = np.random.default_rng(31)
+    apart = []
+    for _ in range(10):
+        t = (np.arange(80) + rng.random()) / 150
+        since = (t - 0.27)[:, None]
+        v = np.array([0.2, -0.1, 1.3])
+        jump = np.array([1.5, 2.0, -1.0])
+        spin = np.array([2.0, -3.0, 1.0])
+        places = v * since - np.array([0, 0, G / 2]) * since**2
+        places = places + 2e-4 * rng.normal(size=places.shape)
+        noise = Rotation.from_rotvec(1e-3 * rng.normal(size=places.shape))
+        before = Rotation.from_rotvec(spin * since)
+        after = Rotation.from_rotvec(np.where(since < 0, spin, spin + jump) * since)
+        sigma = [2e-4] * 3 + [1e-3] * 3
+        found, none = (
+            ji.tracks.find_impacts(
+                t,
+                np.hstack([places, (turns * noise).as_quat()]),
+                sigma,
+                acceleration=[0, 0, -G],
+                quaternion="xyzw",
+            )
+            for turns in (after, before)
+        )
+        assert not none.impacts
+        assert "No impact" in none.warnings[0]
+        assert not any("No impact" in line for line in found.warnings)
+        (impact,) = found.impacts
+        assert abs(impact.time - 0.27) < 5 * impact.time_error
+        errors = np.sqrt(np.diag(impact.covariance))
+        omega = np.concatenate([impact.pre[3:] - spin, impact.post[3:] - spin - jump])
+        apart.append(omega / np.concatenate([errors[3:6], errors[9:]]))
+    assert 0.7 < np.sqrt(np.mean(np.square(apart))) < 1.3
+
+
+def test_shots_hold_what_errors_of_orientations_do_to_lever_arms():
+    """v+ of a corner lies as far from its law as the shots' covariance says."""
+    rng = np.random.default_rng(32)
+    body = ji.Box([0.1, 0.1, 0.1], mass=0.3)
+    law = ji.Newton(0.6, friction=0.2)
+    turn = Rotation.from_rotvec([0.5, 0.3, 0.2])
+    pose = np.asarray(body.touching(np.roll(turn.as_quat(), 1)))
+    before = np.array([0.3, -0.2, -1.5, 3.0, -2.0, 4.0])
+    after = np.asarray(ji.impact(law, body.scenes([pose])[0], before).velocity)
+    sizes = {"with": [], "without": []}
+    for _ in range(12):
+        t = (np.arange(50) + rng.random()) / 148
+        since = (t - 0.17)[:, None]
+        v = np.where(since < 0, before, after)
+        places = pose[:3] + v[:, :3] * since - np.array([0, 0, G / 2]) * since**2
+        places = places + 1e-4 * rng.normal(size=(50, 3))
+        noise = Rotation.from_rotvec(1e-3 * rng.normal(size=(50, 3)))
+        turns = turn * Rotation.from_rotvec(v[:, 3:] * since) * noise
+        track = ji.tracks.find_impacts(
+            t,
+            np.hstack([places, turns.as_quat()]),
+            [1e-4] * 3 + [1e-3] * 3,
+            acceleration=[0, 0, -G],
+            quaternion="xyzw",
+        )
+        shots = track.experiments(body, near=5e-3)
+
+        def predicted(v, scene=shots.scenes[0]):
+            return ji.impact(law, scene, v).velocity
+
+        slopes = np.asarray(jax.jacobian(predicted)(shots.pre[0]))
+        gain = np.hstack([-slopes, np.eye(6)])
+        rest = shots.post[0] - np.asarray(predicted(shots.pre[0]))
+        for name, C in (
+            ("with", shots.covariance[0]),
+            ("without", track.impacts[0].covariance),
+        ):
+            whole = gain @ np.asarray(C) @ gain.T
+            sizes[name].append(rest @ np.linalg.solve(whole, rest))
+    assert 3.5 < np.mean(sizes["with"]) < 9.5  # of 6
+    assert np.mean(sizes["without"]) > 15
