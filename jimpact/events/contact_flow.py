@@ -694,6 +694,12 @@ class ContactFlow(Flow):
         """
         return not self.gapped and self.viscous is None
 
+    def first_cycle(
+        self, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]
+    ) -> Any:
+        """None: friction wedges no contacts; see `wedged_limit.py`."""
+        return None
+
     @property
     def looks_ahead(self) -> bool:
         """True if the chain is so long that a look ahead decides whether it comes to

@@ -32,10 +32,11 @@ from jimpact.events.contact_flow import (
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
-from jimpact.events.plastic_limit import final_impulses, inspect
+from jimpact.events.plastic_limit import final_impulses
 from jimpact.events.run import run
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangential_spring import SpringFlow
+from jimpact.events.wedged_limit import inspect
 from jimpact.numerics.dense import unit
 from jimpact.numerics.derive import Arrays, Kind, in_lanes, without_derivatives
 from jimpact.numerics.sparse import Neighbours
