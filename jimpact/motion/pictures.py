@@ -417,7 +417,7 @@ def _draw_energies(
     first, *more = shares
     label = f"{first.removeprefix('the ')} took"
     axes.plot(time, -shares[first], color=COLOURS[0], label=label)
-    others = (
+    others: tuple[tuple[str, Any], ...] = (
         *((f"{name} took", -shares[name]) for name in more),
         ("the base gave", motion.base_work),
         ("forces gave", motion.force_work),
