@@ -158,5 +158,4 @@ assert nearest["pymunk"] == "Binary"
 assert nearest["simbody"] == "LZB, Hertz"
 
 # %% [markdown]
-# You have finished the course. [Your own CSV file](02_your_own_csv.ipynb) is the notebook to copy
-# for your own data.
+# *Next: [spheres at an angle](19_spheres_at_an_angle.ipynb).*

@@ -42,6 +42,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jimpact.numerics.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.numerics.sparse import Neighbours, neighbour_sum
 from jimpact.numerics.stepper import Flow, any_of, total
+from jimpact.numerics.tangents import without_slope
 from jimpact.numerics.tridiagonal import tridiagonal_product
 
 
@@ -567,14 +568,15 @@ class ContactFlow(Flow):
 
         An event ends the phase whose margin it is: OPEN closes to COMPRESSION, which
         turns to EXPANSION (or YIELD), which opens or is compressed again. See
-        `normal_margins`.
+        `normal_margins`. The state has no slopes where it is `at_corner`.
         """
         m = self.contacts
         phase = modes[:m]
         count = modes[m : 2 * m]
-        x, g, _ = self.rows(y)
         by_x = which[:m]
         by_g = which[m : 2 * m]
+        y = jnp.where(self.at_corner(phase, y, by_g), without_slope(y), y)
+        x, g, _ = self.rows(y)
         if self.slackens:
             after = self._slackening(phase, by_x, by_g)
             opened = by_g & (phase != Phase.OPEN)
@@ -608,6 +610,26 @@ class ContactFlow(Flow):
         count = count + closed.astype(count.dtype)
         modes = jnp.concatenate([after, count, modes[2 * m :]]).astype(modes.dtype)
         return modes, jnp.concatenate([x, g, y[2 * m :]])
+
+    def at_corner(
+        self,
+        phase: Int[Array, "m B"],
+        y: Float[Array, "n B"],
+        turned: Bool[Array, "m B"],
+    ) -> Bool[Array, "1 B"]:
+        """Mask: two contacts with e = 0 that act on each other end compression at once.
+
+        Their expansions take no time. Which of them is over when the other begins
+        depends on the direction in which anything changes, and so do the slopes of the
+        outcome.
+        """
+        _, g, _ = self.rows(y)
+        sudden = (phase == Phase.COMPRESSION) & (self.restitution == 0)
+        ends = sudden & turned
+        together = sudden & (jnp.abs(g) <= self.zero_margin)
+        load = ends.astype(y.dtype)
+        pushed = self.coupling.magnitude().times(load) - load > 0
+        return any_of(together & pushed)
 
     def _slackening(
         self,
@@ -671,6 +693,12 @@ class ContactFlow(Flow):
         `plastic_limit.py`.
         """
         return not self.gapped and self.viscous is None
+
+    def first_cycle(
+        self, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]
+    ) -> Any:
+        """None: friction wedges no contacts; see `wedged_limit.py`."""
+        return None
 
     @property
     def looks_ahead(self) -> bool:

@@ -26,8 +26,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import (
+    DRAGGING,
     SNAP,
-    WIDENED,
     ContactFlow,
     ContactStates,
     Frozen,
@@ -36,10 +36,16 @@ from jimpact.events.contact_flow import (
     plus_one,
     power,
 )
-from jimpact.numerics.dense import load_shares, regularized_once, solve, times, unit
+from jimpact.numerics.dense import (
+    load_shares,
+    regularized,
+    regularized_once,
+    times,
+    unit,
+)
 from jimpact.numerics.friction import distribute
 from jimpact.numerics.stepper import any_of
-from jimpact.tools.loops import cond, fori_loop
+from jimpact.tools.loops import fori_loop
 from jimpact.tools.precision import precision
 
 # part of the unit of time. At the first touch forces are 0 and cannot decide which
@@ -53,13 +59,6 @@ PIECES = 4
 # included. Ten times more is the energy of one tolerance of velocity, which would be
 # lost.
 LEFT = 0.1
-
-
-# Closings of a contact from which on it is wedged if it hardly moves at the end. Ten
-# times
-# more: ends of fewer closings stay coarse; ten times less: contacts that come to rest
-# otherwise.
-WEDGED = 100
 
 
 def ridge(dtype: Any) -> float:
@@ -93,6 +92,27 @@ class FrictionForces(NamedTuple):
     room: Float[Array, "m B"]
 
 
+class Cycle(NamedTuple):
+    """A state to which an impact may return, and what is left once it has."""
+
+    modes: Int[Array, "modes B"]  # at that state
+    passes: Float[Array, "1 B"]  # until it; 0: there is none
+    gamma: Float[Array, "m B"]
+    root: Float[Array, "m B"]  # of twice the energy stored
+    slip: Float[Array, "m B"]
+    impulse: Float[Array, "m B"]  # p, and after the return what is left of it
+    side: Float[Array, "m B"]  # q, and after the return what is left of it
+    wedged: Bool[Array, "m B"]  # contacts that end with gamma = 0
+    stops: Bool[Array, "m B"]  # those of them that end with u = 0
+
+    @classmethod
+    def none(cls, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]) -> "Cycle":
+        """The cycle before the first state is kept."""
+        zero = jnp.zeros_like(gamma)
+        no = jnp.zeros(gamma.shape, bool)
+        return cls(modes, zero[:1], zero, zero, zero, zero, zero, no, no)
+
+
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):
@@ -119,6 +139,11 @@ class FrictionFlow(ContactFlow):
         """Slip u of a state."""
         m = self.contacts
         return y[3 * m : 4 * m]
+
+    def side_impulse(self, y: Float[Array, "n B"]) -> Float[Array, "t B"]:
+        """Tangential impulse of a state, its last rows but the time."""
+        t = self.normal_tangent.shape[1]
+        return y[-1 - t : -1]
 
     def start_with(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
@@ -374,12 +399,42 @@ class FrictionFlow(ContactFlow):
         side = y[-1 - self.normal_tangent.shape[1] : -1]
         return super().change(y) + times(self.normal_tangent, side)
 
-    # ---- the end: a contact with friction is no multiple of another state
+    # ---- the end
+
+    @property
+    def wedges(self) -> bool:
+        """True if rigid contacts in the plane: a state multiplied by s then takes the
+        same course, see `wedged_limit.py`.
+        """
+        planar = self.normal_tangent.shape[1] == self.contacts
+        return planar and not self.gapped and self.viscous is None
 
     @property
     def self_similar(self) -> bool:
-        """False: with friction a multiple of a state takes another course."""
+        """True if friction may wedge the contacts."""
+        return self.wedges
+
+    def first_cycle(
+        self, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]
+    ) -> Any:
+        """The cycle before a state is kept; None where no contacts can be wedged."""
+        return Cycle.none(gamma, modes) if self.wedges else None
+
+    @property
+    def looks_ahead(self) -> bool:
+        """False: a look ahead knows no friction."""
         return False
+
+    def pauses(
+        self,
+        before: Int[Array, "modes B"],
+        after: Int[Array, "modes B"],
+        passes: Float[Array, "1 B"],
+    ) -> Bool[Array, "1 B"] | None:
+        """Mask: after an event, where the impact drags on."""
+        if not self.wedges:
+            return None
+        return any_of(before != after) & (passes > DRAGGING * self.taking_part)
 
     @property
     def at_once(self) -> bool:
@@ -405,88 +460,51 @@ class FrictionFlow(ContactFlow):
         if self.at_once:
             return modes, self._after_one(modes, y)
         m = self.contacts
-        ended = jnp.concatenate([jnp.zeros_like(y[:m]), y[m:]])
-        if self.normal_tangent.shape[1] != m:
-            return modes, ended
-        wedged = self.wedged(modes, y)
-        return modes, cond(
-            jnp.any(wedged), lambda: self.unwedged(modes, ended, wedged), lambda: ended
-        )
+        return modes, jnp.concatenate([jnp.zeros_like(y[:m]), y[m:]])
 
-    def wedged(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
-    ) -> Bool[Array, "m B"]:
-        """Mask of contacts that hardly move, where one closed WEDGED times: they decay
-        to 0.
-
-        Those that closed often, and those that still approach.
-        """
-        m = self.contacts
-        gamma = self.scales(modes) * self.rows(y)[1]
-        slow = jnp.abs(gamma) <= WIDENED * self.tolerance
-        often = slow & (modes[m : 2 * m] >= WEDGED)
-        approaches = slow & (gamma < -SNAP * self.tolerance)
-        return (often | approaches) & any_of(often)
-
-    def unwedged(
-        self,
-        modes: Int[Array, "modes B"],
-        y: Float[Array, "n B"],
-        wedged: Bool[Array, "m B"],
+    def settled(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], cycle: Cycle
     ) -> Float[Array, "n B"]:
-        """The state in the limit of the `wedged` contacts, where friction permits it.
+        """The state in the limit of contacts that friction wedges: see `Cycle`.
 
-        With the impulses p and q that are left, `gamma + G p + K_nt q = 0` of these
-        contacts, and `u + K_tn p + K_tt q = 0` where slip is as small, else
-        `q = -mu p sign(u)`; p = q = 0 of others. What does not stop within its cone
-        slides. The state remains where that needs p < 0 or |q| > mu p.
+        With the impulses P and Q that are left `gamma + G P + K_nt Q = 0` of these
+        contacts, and `u + K_tn P + K_tt Q = 0` where slip stops, else
+        `Q = -mu P sign(u)`; P = Q = 0 of others. Where contacts are redundant, P and Q
+        are next to those of the series.
         """
         m = self.contacts
-        x, g, p = self.rows(y)
+        _, g, p = self.rows(y)
         u = self.slip(y)
-        stops = wedged & (jnp.abs(u) <= WIDENED * self.tolerance)
-        eye = unit(self.tangent)
-        coupling = self.coupling.dense(m)
-        across = self.normal_tangent
-        back = jnp.swapaxes(self.normal_tangent, 0, 1)
-        drag = self.friction * jnp.sign(jax.lax.stop_gradient(u))
         gamma = self.scales(modes) * g
-
-        def solved(
-            stops: Bool[Array, "m B"],
-        ) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
-            """Impulses p and q that are left where the contacts `stops` have no
-            slip.
-            """
-            slides = (wedged & ~stops)[:, None]
-            rubs = jnp.where(slides, eye * drag[:, None], 0.0)
-            lower = [
-                jnp.where(stops[:, None], back, rubs),
-                jnp.where(stops[:, None], self.tangent, eye),
-            ]
-            normal = jnp.where(wedged[:, None], coupling, eye)
-            upper = [normal, jnp.where(wedged[:, None], across, 0.0)]
-            matrix = jnp.concatenate(
-                [jnp.concatenate(z, axis=1) for z in (upper, lower)]
-            )
-            right = [jnp.where(wedged, -gamma, 0.0), jnp.where(stops, -u, 0.0)]
-            left = solve(matrix, jnp.concatenate(right)[:, None])[:, 0]
-            return left[:m], left[m:]
-
-        def above(
-            dp: Float[Array, "m B"], dq: Float[Array, "m B"]
-        ) -> Bool[Array, "m B"]:
-            """Mask of contacts beyond their cones."""
-            return jnp.abs(dq) > self.friction * jnp.abs(dp) + SNAP * self.tolerance
-
-        first = above(*solved(stops))
-        dp, dq = solved(stops & ~first)
-        fails = any_of(~jnp.isfinite(dp + dq) | (dp < 0) | above(dp, dq))
-        dp = jnp.where(fails, 0.0, dp)
-        dq = jnp.where(fails, 0.0, dq)
+        across = self.normal_tangent
+        back = jnp.swapaxes(across, 0, 1)
+        coupling = self.coupling.dense(m)
+        eye = unit(self.tangent)
+        drag = -self.friction * jnp.sign(jax.lax.stop_gradient(u))
+        # rows of P, then of Q; those of a contact that slides, or is not wedged: of Q -
+        # r P
+        wedged = cycle.wedged[:, None]
+        stops = cycle.stops[:, None]
+        rubs = jnp.where(wedged, -eye * drag[:, None], 0.0)
+        normal = [jnp.where(wedged, coupling, eye), jnp.where(wedged, across, 0.0)]
+        side = [jnp.where(stops, back, rubs), jnp.where(stops, self.tangent, eye)]
+        rows = [jnp.concatenate(z, axis=1) for z in (normal, side)]
+        matrix = jnp.concatenate(rows)
+        right = [
+            jnp.where(cycle.wedged, -gamma, 0.0),
+            jnp.where(cycle.stops, -u, 0.0),
+        ]
+        left = jnp.concatenate([cycle.impulse, cycle.side])
+        error = jnp.concatenate(right) - times(matrix, left)
+        soft = jnp.full_like(left, ridge(u.dtype))
+        left = left + regularized(matrix, error, soft, 1, without_null=True)
+        dp = left[:m]
+        dq = left[m:]
         g = g + self.as_rows(modes, times(coupling, dp) + times(across, dq))
         u = u + times(back, dp) + times(self.tangent, dq)
-        return jnp.concatenate([x, g, p + dp, u, y[4 * m : 5 * m] + dq, y[5 * m :]])
+        none = jnp.zeros_like(g)
+        total_side = self.side_impulse(y) + dq
+        return jnp.concatenate([none, g, p + dp, u, total_side, y[5 * m :]])
 
     def _after_one(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]

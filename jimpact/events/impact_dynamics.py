@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jimpact.core.contact import Contact
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import (
+    SNAP,
     Chain,
     ContactFlow,
     Coupling,
@@ -31,16 +32,24 @@ from jimpact.events.contact_flow import (
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
-from jimpact.events.plastic_limit import final_impulses, inspect
+from jimpact.events.plastic_limit import final_impulses
 from jimpact.events.run import run
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangential_spring import SpringFlow
+from jimpact.events.wedged_limit import inspect
 from jimpact.numerics.dense import unit
 from jimpact.numerics.derive import Arrays, Kind, in_lanes, without_derivatives
 from jimpact.numerics.sparse import Neighbours
 from jimpact.numerics.step_impulses import descent_lengths
+from jimpact.numerics.stepper import any_of
 from jimpact.numerics.tangential import TangentialBlock
-from jimpact.numerics.tangents import Dual, is_dual, pushforward, value_of
+from jimpact.numerics.tangents import (
+    Dual,
+    is_dual,
+    pushforward,
+    value_of,
+    without_slope,
+)
 from jimpact.numerics.tridiagonal import (
     Structure,
     Symmetric,
@@ -288,6 +297,42 @@ def flow_of(
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
 
+def undecided(problem: Problem) -> Bool[Array, "1 B"]:
+    """Mask: a contact touches at rest, and its force does not begin at 0.
+
+    It can take any force up to F(0) without motion: whether it moves depends on the
+    direction in which anything changes.
+    """
+    gamma = problem.gamma
+    if problem.viscous is None or problem.gap is None:
+        return jnp.zeros_like(gamma[:1], bool)
+    none = jnp.zeros_like(gamma)
+    touches = (problem.gap <= 0) & (jnp.abs(gamma) <= SNAP * problem.tolerance)
+    return any_of(touches & (problem.viscous.push(none, none) > 0))
+
+
+def begins_with_a_jump(problem: Problem) -> Bool[Array, "1 B"]:
+    """Mask: forces jump as a contact closes, or opens, between two steps.
+
+    As it closes there is a force where it is F(0, x') > 0, as it opens where F(0, 0) >
+    0; the only contact is closed from the beginning. Steps of fixed length do not move
+    with the jump, nor do their slopes.
+    """
+    gamma = problem.gamma
+    if problem.viscous is None:
+        return jnp.zeros_like(gamma[:1], bool)
+    none = jnp.zeros_like(gamma)
+    jumps = problem.viscous.push(none, none) > 0
+    if len(gamma) > 1:
+        jumps = jumps | (problem.viscous.push(none, none - 1) > 0)
+    return any_of(jumps)
+
+
+def with_slopes_unless(mask: Bool[Array, "1 B"], p: Any) -> Any:
+    """Impulses p, with NaN for each tangent where the `mask` is True."""
+    return pushforward(lambda p: jnp.where(mask, without_slope(p), p), p)
+
+
 @dataclasses.dataclass(frozen=True)
 class ImpulseProgram:
     """Outcomes from the leaves of a `Problem` with a batch in the last axis.
@@ -361,6 +406,7 @@ class ImpulseProgram:
                 p = Dual(p, plastic.tangents)
             else:
                 p = plastic
+        p = with_slopes_unless(undecided(value_of(problem)), p)
         rest = pushforward(lambda y: (y[tangential], y[-1:]), state)
         return p, *rest, end.status, end.carry.passes.astype(jnp.int32)
 
@@ -429,7 +475,9 @@ class ImplicitProgram(ImpulseProgram):
         run = implicit_steps.run(flow, start, self.most, self.checkpoints)
         m = len(value_of(start.indentation))
         # rows of the impulse: m normal ones, then the tangential ones
-        impulses = pushforward(lambda p: (p[:m], p[m:]), run.state.impulse)
+        jumps = begins_with_a_jump(jax.tree.unflatten(self.tree, values))
+        impulse = with_slopes_unless(jumps, run.state.impulse)
+        impulses = pushforward(lambda p: (p[:m], p[m:]), impulse)
         return *impulses, run.state.time, self.code(flow, run), run.passes
 
     def code(

@@ -16,8 +16,8 @@ from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
 from jimpact.events.implicit_steps import ImplicitState
-from jimpact.events.plastic_limit import inspect
 from jimpact.events.run import run
+from jimpact.events.wedged_limit import inspect
 from jimpact.numerics import stepper
 
 

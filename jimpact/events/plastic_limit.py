@@ -148,7 +148,7 @@ def contacts_at_rest(
     meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
     rest = resting | (often & ends)
-    new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
+    new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends, last.cycle)
     inspected = paused | any_of(resting)
     return jax.tree.map(lambda a, b: jnp.where(inspected, a, b), new, last)
 
@@ -169,7 +169,8 @@ def block_at_rest(
     after = now + flow.coupling.times(dp)  # gamma+
     admissible = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
     ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & admissible)
-    new = Rest(block, block, rest.rows.at[2].set(dp), rest.closings, ended)
+    rows = rest.rows.at[2].set(dp)
+    new = Rest(block, block, rows, rest.closings, ended, rest.cycle)
     return jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, rest)
 
 

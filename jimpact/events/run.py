@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.events.contact_flow import ContactFlow
 from jimpact.numerics import stepper
 from jimpact.numerics.driver import SLOTS_WITH_TANGENTS, until_over
 from jimpact.numerics.stepper import Mark, any_of
 from jimpact.numerics.tangents import dual_like, is_dual, pushforward, value_of
+from jimpact.tools.loops import cond
 from jimpact.tools.status import CODE
 
 
@@ -38,6 +38,8 @@ class Rest(NamedTuple):
     rows: Float[Array, "3 m B"]
     closings: Int[Array, "m B"]
     ended: Bool[Array, "1 B"]  # by a state that returned as a part of itself
+    # of contacts that friction may wedge: see `wedged_limit.py`
+    cycle: Any = None
 
     @classmethod
     def none(cls, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]) -> "Rest":
@@ -140,7 +142,9 @@ def run(
         settled = jnp.where(rest.ended, Mark.OVER, Mark.GOES_ON)
         return _OnItsWay(carry.marked(paused, settled), rest, now.seen)
 
-    start = _OnItsWay(stepper.begin(flow, modes, y), Rest.none(gamma, modes), seen)
+    cycle = value_of(flow).first_cycle(gamma, modes)
+    rest = Rest.none(gamma, modes)._replace(cycle=cycle)
+    start = _OnItsWay(stepper.begin(flow, modes, y), rest, seen)
     slots = value_of(flow).slots
     if is_dual(y):
         slots = min(slots, SLOTS_WITH_TANGENTS)
@@ -164,9 +168,17 @@ def _finished(
     carry, rest, seen = last
     over = (carry.mark == Mark.OVER) & ~rest.ended
 
-    def at_end(flow: ContactFlow, y: Float[Array, "n B"]) -> Float[Array, "n B"]:
+    def at_end(flow: Any, y: Float[Array, "n B"]) -> Float[Array, "n B"]:
         """The state, finished where the impact is over."""
-        return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
+        modes = carry.step.modes
+        finished = jnp.where(over, flow.finish(modes, y)[1], y)
+        if rest.cycle is None:
+            return finished
+        return cond(
+            jnp.any(rest.ended),
+            lambda: jnp.where(rest.ended, flow.settled(modes, y, rest.cycle), finished),
+            lambda: finished,
+        )
 
     y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
     end = carry._replace(y=y)

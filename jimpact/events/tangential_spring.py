@@ -513,8 +513,7 @@ class SpringFlow(FrictionFlow):
         """False: no impact with a spring is in closed form."""
         return False
 
-    def wedged(
-        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
-    ) -> Bool[Array, "m B"]:
-        """None: the limit of wedged contacts is that of rigid ones."""
-        return jnp.zeros_like(y[: self.contacts], bool)
+    @property
+    def wedges(self) -> bool:
+        """False: `settled` ends contacts that stick rigidly."""
+        return False

@@ -75,10 +75,12 @@ class Compliant(Law):
     if checked.
 
     Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-;
-    one-sided where a gap is 0 and at grazing events. Where two orders of collision
-    meet, the outcome changes within gaps of about `gap_scale`; there derivatives are of
-    order |change of v+| / `gap_scale`. Method 'implicit' has first derivatives only, as
-    in `LZB`.
+    one-sided where a gap is 0 and at grazing events; NaN as in `LZB`, and where a
+    contact touches at rest whose force does not begin at 0, F(0) > 0. Where two orders
+    of collision meet, the outcome changes within gaps of about `gap_scale`; there
+    derivatives are of order |change of v+| / `gap_scale`. Method 'implicit' has first
+    derivatives only, as in `LZB`; NaN where forces jump as contacts close or open
+    (`KelvinVoigt` with several contacts, F(0) > 0), which its steps do not follow.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.16).
 

@@ -421,7 +421,7 @@ class UserForce(Force):
         function: smooth for x >= 0; it must push at x > 0, rate = 0. Where F(0) > 0 the
             contact ends at x = 0 with that force. Contacts that touch at rest can then
             take any force up to F(0) without motion; this is not resolved (status
-            `max_steps`).
+            `max_steps`, or slopes that are NaN).
         parameters: any pytree; its arrays are differentiable. `calibrate` finds the
             entry 'damping' of a dict.
 

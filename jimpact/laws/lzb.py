@@ -163,16 +163,13 @@ class LZB(Law):
     `ill_conditioned` if checked.
 
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e =
-    0 and
-    e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three
-    equal
-    linear balls), and where slip stops just as a contact opens. Where several contacts
-    end together with e = 0 (a block that lands flat), slopes in e depend on the
-    direction, and those returned need not be those of any. In `initial_energy` at 0 the
-    true
-    slope may be infinite; 0 is returned. Method 'implicit' has first derivatives only,
-    of what it computes: at the default `rtol` they are right to 1e-3 or 5e-3; second
-    ones raise.
+    0 and e = 1, at touching contacts, at grazing events (e.g. k2/k1 = 6.1713 for three
+    equal linear balls), and where slip stops just as a contact opens. They are NaN
+    where two contacts with e = 0 that act on each other end their compression at once
+    (a block that lands flat): slopes there depend on the direction. Method 'implicit'
+    returns those of equal e_j -> 0 there, has first derivatives only, of what it
+    computes (at the default `rtol` right to 1e-3 or 5e-3), and raises for second ones.
+    In `initial_energy` at 0 the true slope may be infinite; 0 is returned.
 
     Source: Liu, Zhao and Brogliato, Proc. R. Soc. A 464 (2008) 3193 and 465 (2009) 1;
     Brogliato, Nonsmooth Mechanics (2016), (6.67)-(6.73) with the errata of

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from jimpact.bodies.base import Body, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential
-from jimpact.motion.record import Motion
+from jimpact.motion.record import Motion, contact_shares
 from jimpact.motion.system import System
 from jimpact.plot.style import (
     COLOURS,
@@ -413,10 +413,12 @@ def _draw_energies(
     axes.plot(at, energy - least, color="black", label="T + V − min V")
     axes.plot(at, kinetic_energy, color=GREY, lw=0.8, label="T")
     # the sum: in a multiple impact the shares of single contacts may have either sign
-    normal, tangential = np.asarray(motion.contact_work).sum(axis=-1).T
-    axes.plot(time, -normal, color=COLOURS[0], label="contacts took")
-    others = (
-        ("friction took", -tangential),
+    shares = contact_shares(motion)
+    first, *more = shares
+    label = f"{first.removeprefix('the ')} took"
+    axes.plot(time, -shares[first], color=COLOURS[0], label=label)
+    others: tuple[tuple[str, Any], ...] = (
+        *((f"{name} took", -shares[name]) for name in more),
         ("the base gave", motion.base_work),
         ("forces gave", motion.force_work),
     )

@@ -25,6 +25,9 @@ EVENT_KINDS = (
     "paroxysm",
 )
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not printed
+# of the energy: what friction gives at most by rounding. Ten times more: less is shown
+# as given; ten times less: sums of rounding hide the shares
+_ROUNDED = 1e-9
 FORMAT = 1  # version of the files of motions
 
 KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
@@ -308,10 +311,9 @@ class Motion(eqx.Module):
         row = STATUS[int(self.status)]
         reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
         last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
-        normal, tangential = np.asarray(self.contact_work)[max(last, 0)].sum(axis=-1)
-        works = {
-            "the contacts": normal,
-            "friction": tangential,
+        shares = contact_shares(self).items()
+        works = {name: work[max(last, 0)] for name, work in shares}
+        works |= {
             "the base": self.base_work[last],
             "forces": self.force_work[last],
         }
@@ -370,6 +372,22 @@ def read_motion(path: Path) -> Motion:
     values = {name: jnp.asarray(x) for name, x in arrays.items()}
     rows = {name: values.pop(f"events.{name}") for name in Events.__dataclass_fields__}
     return Motion(events=Events(**rows), **values)
+
+
+def contact_shares(motion: Motion) -> dict[str, np.ndarray]:
+    """Works (S,) [J] of `the contacts` and of `friction`, or of both together.
+
+    The share of an impact is `p (gamma- + gamma+) / 2` or `p_t . (u- + u+) / 2`. Their
+    sum is the work; each alone is where velocities are linear in its impulse. Where
+    slip reverses, and `friction` would give energy by that, only the sum is stated.
+    """
+    works = np.asarray(motion.contact_work).sum(axis=-1)
+    normal, tangential = works.T
+    added = np.diff(tangential[np.isfinite(tangential)])
+    largest = np.nanmax(np.abs(np.asarray(motion.energy)), initial=0.0)
+    if np.max(added, initial=0.0) > _ROUNDED * largest:
+        return {"contacts and friction": normal + tangential}
+    return {"the contacts": normal, "friction": tangential}
 
 
 def _work_report(works: dict[str, Any]) -> str:

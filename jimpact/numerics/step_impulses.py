@@ -242,5 +242,8 @@ def _solve_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
     _, right = jax.jvp(reached, (problem,), (change,))
     ridge = jnp.full_like(impulses, RIDGE)
-    rate = regularized(problem.derivative(impulses), right, ridge, 1)
+    # `without_null`: a direction of one contact's slip alone, which redundant contacts
+    # do not have, would be taken up by impulses of 1 / RIDGE
+    matrix = problem.derivative(impulses)
+    rate = regularized(matrix, right, ridge, 1, without_null=True)
     return (impulses, left), (rate, jnp.zeros_like(left))

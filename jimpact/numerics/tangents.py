@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Shaped
+from jaxtyping import Array, Float, Shaped
 
 from jimpact.tools.loops import varying_like
 
@@ -112,3 +112,19 @@ def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
     directions = duals[0].tangents.shape[TANGENT_AXIS]
     none = jnp.zeros((*x.shape[:-1], directions, x.shape[-1]), x.dtype)
     return Dual(x, varying_like(none, duals))
+
+
+@jax.custom_jvp
+def without_slope(x: Float[Array, "*rows"]) -> Float[Array, "*rows"]:
+    """x as it is where it has no derivative: all of its tangents are NaN."""
+    return x
+
+
+@without_slope.defjvp
+def _no_slope(
+    primals: tuple[Float[Array, "*rows"]], tangents: tuple[Float[Array, "*rows"]]
+) -> tuple[Float[Array, "*rows"], Float[Array, "*rows"]]:
+    """x, and NaN for each tangent."""
+    (x,) = primals
+    (rate,) = tangents
+    return without_slope(x), jnp.nan * rate

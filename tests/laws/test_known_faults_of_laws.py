@@ -182,3 +182,66 @@ def test_friction_of_many_contacts_in_single_precision_batches():
         np.testing.assert_allclose(
             lane, ji.impact(double[1], double[0], v.astype(float)).velocity, atol=1e-4
         )
+
+
+def test_contacts_of_no_restitution_that_turn_at_once_have_no_slopes():
+    """They were those of one order of two: of no direction. Away from it they are right."""
+    block = ji.Block(1.2, 1.7, corners="base").scene()
+    law = ji.LZB([0.0, 0.0], [1.0, 1.0])
+
+    def after(v):
+        return ji.impact(law, block, v).velocity
+
+    flat, tilting = jnp.array([0.2, -1.0, 0.0]), jnp.array([0.2, -1.0, 0.4])
+    assert np.isfinite(after(flat)).all()
+    slopes = jax.jit(jax.jacfwd(after))
+    assert np.isnan(slopes(flat)).all()
+    ahead = np.array([0.1, 0.3, -0.2])
+    difference = (after(tilting + 1e-5 * ahead) - after(tilting - 1e-5 * ahead)) / 2e-5
+    np.testing.assert_allclose(slopes(tilting) @ ahead, difference, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_slopes_by_steps_of_contacts_that_share_one_tangent():
+    """Directions in which only one of two redundant contacts slips were amplified."""
+    block = ji.Block(1.0, 1.5, corners="base").scene()
+
+    def slopes(method, rtol):
+        def after(v):
+            law = ji.LZB(0.4, [1.0, 1.3], friction=0.35, method=method, rtol=rtol)
+            return ji.impact(law, block, v).velocity
+
+        return jax.jacfwd(after)(jnp.array([0.1, -1.0, 0.0]))
+
+    np.testing.assert_allclose(
+        slopes("implicit", 1e-7), slopes("time", 1e-9), atol=2e-3
+    )
+
+
+def slopes_of_balls(force, gap, method="time"):
+    """Slopes of v+ in a velocity of two balls of three, and their differences."""
+    scene = ji.chain([1.0, 1.2, 0.9], gaps=[0.0, gap])
+
+    def after(z):
+        law = ji.Compliant(force, method=method)
+        return ji.impact(law, scene, jnp.stack([1.0 + z, z, 0.0])).velocity
+
+    return jax.jacfwd(after)(0.0), (after(1e-4) - after(-1e-4)) / 2e-4
+
+
+def test_a_force_that_begins_with_a_jump_at_rest_has_no_slopes():
+    """Whether the balls at rest part depends on the direction; behind a gap it does not."""
+    jumps = ji.UserForce(lambda x, rate, k: k * x + 0.04, 1.0)
+    slopes, difference = slopes_of_balls(jumps, 0.02)
+    np.testing.assert_allclose(slopes, difference, atol=1e-6)
+    assert np.isnan(slopes_of_balls(jumps, 0.0)[0]).all()
+
+
+@pytest.mark.parametrize("force", [ji.KelvinVoigt(1.0, 0.3), ji.HuntCrossley(1.0, 0.3)])
+def test_slopes_by_steps_across_a_jump_are_not_given(force):
+    """Steps do not move with the instant of closing: slopes were off by some percent."""
+    slopes, _ = slopes_of_balls(force, 0.02, "implicit")
+    if isinstance(force, ji.KelvinVoigt):
+        assert np.isnan(slopes).all()
+    else:
+        np.testing.assert_allclose(slopes, slopes_of_balls(force, 0.02)[0], atol=2e-3)

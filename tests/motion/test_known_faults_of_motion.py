@@ -8,6 +8,7 @@ import piles
 import pytest
 
 import jimpact as ji
+from jimpact.motion.record import contact_shares
 
 G = 9.80665
 
@@ -179,3 +180,22 @@ def test_pendulums_that_swing_side_by_side_stay_together():
     np.testing.assert_array_equal(motions.status, 0)
     np.testing.assert_array_equal(motions.events.count, 0)
     np.testing.assert_allclose(motions.q - motions.q[..., :1], 0, atol=1e-15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("corners", "shares"), [("base", 1), (None, 2)])
+def test_a_report_of_a_motion_has_no_friction_that_gives(corners, shares):
+    """Mean slips of impacts gave energy where slip reverses: the sum is the work."""
+    if corners is None:
+        system = ji.System(ji.Disc(1.0, 0.2), gravity=True)
+        start = [0.0, 1.4, 0.0], [2.0, 0.0, 0.0]
+    else:
+        system = ji.System(ji.Block(1.0, 1.0, corners=corners), gravity=True)
+        start = [0.0, 0.9, 0.15], [0.0, 0.0, 0.0]
+    motion = ji.simulate(system, ji.Moreau(0.5, friction=0.3), *start, 1.0)
+    text = str(motion)
+    assert "gave" not in text
+    assert len(contact_shares(motion)) == shares
+    total = sum(work[-1] for work in contact_shares(motion).values())
+    change = float(motion.energy[-1] - motion.energy[0])
+    assert total == pytest.approx(change, abs=1e-6 * float(motion.energy[0]))
