@@ -39,12 +39,17 @@ RADIUS = 2.5e-3  # m
 SPEED = 3.9  # m/s
 mass = 4000 * 4 / 3 * np.pi * RADIUS**3
 inertia = 0.4 * mass * RADIUS**2
-# coordinates: along the plane, away from it, turn; slip is v_x + R omega
-sphere = ji.Scene(
-    [mass, mass, inertia],
-    [[0.0], [1.0], [0.0]],
-    tangents=[[1.0], [0.0], [RADIUS]],
-)
+# a sphere that turns about one axis moves like a disc of its moment of inertia; coordinates:
+# along the plane, away from it, turn; slip is v_x + R omega
+disc = ji.Disc(RADIUS, mass, inertia)
+touching = [0.0, RADIUS, 0.0]
+sphere = disc.scene(touching)
+ji.plot.system(disc, touching)
+
+# %% [markdown]
+# The shots, by their angle of incidence:
+
+# %%
 
 
 def approach(degrees):

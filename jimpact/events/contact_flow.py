@@ -174,7 +174,14 @@ class Viscous(NamedTuple):
 
 
 # fields of flows and couplings that are no arrays: they belong to the program
-COMPILED_IN = ("exponent_static", "gapped", "closed_form", "watches", "neighbours")
+COMPILED_IN = (
+    "exponent_static",
+    "gapped",
+    "closed_form",
+    "watches",
+    "slopes",
+    "neighbours",
+)
 
 
 def as_pytree(kind: type[T]) -> type[T]:
@@ -341,6 +348,7 @@ class ContactFlow(Flow):
     # less smooth at x = 0 than F. At exponent 1 F is linear, and steps of any length
     # would do for it alone.
     watches: bool = False
+    slopes: bool = False  # the run has derivatives: states without any are marked
 
     longest = math.inf  # no rate is much larger than the others
 
@@ -575,7 +583,8 @@ class ContactFlow(Flow):
         count = modes[m : 2 * m]
         by_x = which[:m]
         by_g = which[m : 2 * m]
-        y = jnp.where(self.at_corner(phase, y, by_g), without_slope(y), y)
+        if self.slopes:
+            y = jnp.where(self.at_corner(phase, y, by_g), without_slope(y), y)
         x, g, _ = self.rows(y)
         if self.slackens:
             after = self._slackening(phase, by_x, by_g)

@@ -277,6 +277,7 @@ def flow_of(
         gapped=problem.gap is not None,
         closed_form=viscous is None and problem.limit is None,
         limit=problem.limit,
+        slopes=tighten < 1,
     )
     x = first_indentation(problem, exponent)
     if problem.tangential is None:

@@ -324,7 +324,8 @@ def fit_laws(
         `LawFits`; `print` gives a table and why each law is adequate or not.
 
     Raises:
-        ValueError: unknown laws, no law that can be fitted.
+        ValueError: unknown laws, no law that can be fitted, a name in `free` that no
+            law has.
 
     >>> import numpy as np
     >>> import jimpact as ji
@@ -340,6 +341,7 @@ def fit_laws(
     check_kind("data", data, Experiments)
     scenes = data.each(scene, lambda s: s)
     candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
+    _check_free(tuple(free), candidates)
     fits: dict[str, Fit] = {}
     search = Search(seed=seed, progress=False)
     options: dict[str, Any] = {"starts": starts, "profiles": False, "search": search}
@@ -380,6 +382,18 @@ def fit_laws(
 
 
 Candidate = tuple[Law, Any]  # and what is free in it
+
+
+def _check_free(more: tuple[str, ...], candidates: dict[str, Candidate]) -> None:
+    """Raise a ValueError for a name in `free` that no law has, or that has no value."""
+    laws = [law for law, _ in candidates.values()]
+    known = sorted({name for law in laws for name in free_parameters_of(law)})
+    for name in more:
+        if name not in known:
+            raise ValueError(
+                "Argument `free` must hold parameters that a law has and that have a "
+                f"value, {', '.join(known)}, but holds {name!r}."
+            )
 
 
 def _candidates(

@@ -784,3 +784,47 @@ def test_the_module_ends_with_the_exit_code_of_the_command():
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "Did you mean fit?" in done.stderr
+
+
+SPRING = """
+title = "A disc at an angle"
+[scene]
+kind = "Disc"
+radius_m = 0.5
+mass_kg = 2.0
+inertia_kg_m2 = 0.2
+q = [0.0, 0.5, 0.0]
+[law]
+name = "lzb"
+restitution = 0.8
+friction = 0.3
+tangential_stiffness = 0.5
+[fit]
+free = ["restitution", "friction", "tangential_stiffness"]
+starts = 6
+[data]
+file = "shots.csv"
+"""
+
+
+@pytest.mark.slow
+def test_fit_of_a_tangential_spring(tmp_path, capsys):
+    """Five shots without noise return e, mu and kappa."""
+    scene = ji.Disc(0.5, mass=2.0, inertia=0.2).scene([0.0, 0.5, 0.0])
+    law = ji.LZB(0.9, friction=0.15, tangential_stiffness=0.8)
+    head = "pre_1[m/s],pre_2[m/s],pre_3[rad/s],post_1[m/s],post_2[m/s],post_3[rad/s]"
+    rows = [head]
+    for angle in np.radians([4.0, 9.0, 15.0, 30.0, 50.0]):
+        before = np.array([np.sin(angle), -np.cos(angle), 0.0])
+        after = np.asarray(ji.impact(law, scene, before).velocity)
+        rows.append(",".join(f"{x:.8f}" for x in [*before, *after]))
+    study = written(tmp_path, SPRING, "\n".join(rows) + "\n")
+    code, said = call(capsys, "fit", study, "--json", "--out", tmp_path)
+    assert code == 0
+    (fit,) = json.loads(said.out)["fits"].values()
+    found = [row["value"] for row in fit["parameters"]]
+    np.testing.assert_allclose(found, [0.9, 0.15, 0.8], atol=1e-3)
+    missing = SPRING.replace("friction = 0.3\n", "")
+    code, said = call(capsys, "fit", written(tmp_path, missing, "\n".join(rows)))
+    assert code == 2
+    assert "friction" in said.err

@@ -312,3 +312,35 @@ def test_values_with_an_exponent_are_printed():
     data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=post, sigma=1e-6)
     report = str(ji.fit_laws(ji.chain([1.0, 1.0]), data, ["newton", "moreau"]))
     assert report.count("restitution 8.004e-06") == 2
+
+
+def disc_at_angles(law):
+    """A disc on the ground, shots at four angles, and v+ by the law."""
+    scene = ji.Disc(0.5, mass=2.0, inertia=0.2).scene([0.0, 0.5, 0.0])
+    angles = np.radians([4.0, 9.0, 15.0, 30.0, 50.0])
+    before = np.stack([np.sin(angles), -np.cos(angles), 0 * angles], axis=1)
+    after = [ji.impact(law, scene, v).velocity for v in before]
+    return scene, ji.Experiments(before, np.array(after), sigma=1e-3)
+
+
+@pytest.mark.slow
+def test_a_spring_is_chosen_where_the_shots_tell_it():
+    springs = ji.LZB(0.8, friction=0.2, tangential_stiffness=0.7)
+    scene, shots = disc_at_angles(springs)
+    laws = {
+        "rigid": ji.LZB(0.7, friction=0.3),
+        "springs": ji.LZB(0.7, friction=0.3, tangential_stiffness=1.0),
+    }
+    found = ji.fit_laws(
+        scene, shots, laws, free=["friction", "tangential_stiffness"], starts=8
+    )
+    best = next(iter(found.entries))
+    assert best == "springs"
+    law = found.entries[best].fit.law
+    assert float(law.tangential_stiffness) == pytest.approx(0.7, abs=0.01)
+
+
+def test_free_parameters_that_no_law_has_are_refused():
+    scene, shots = disc_at_angles(ji.Newton(0.5, friction=0.2))
+    with pytest.raises(ValueError, match="tangential_stiffness"):
+        ji.fit_laws(scene, shots, ["newton"], free=["tangential_stiffness"])

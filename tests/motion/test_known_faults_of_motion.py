@@ -8,7 +8,6 @@ import piles
 import pytest
 
 import jimpact as ji
-from jimpact.motion.record import contact_shares
 
 G = 9.80665
 
@@ -195,7 +194,4 @@ def test_a_report_of_a_motion_has_no_friction_that_gives(corners, shares):
     motion = ji.simulate(system, ji.Moreau(0.5, friction=0.3), *start, 1.0)
     text = str(motion)
     assert "gave" not in text
-    assert len(contact_shares(motion)) == shares
-    total = sum(work[-1] for work in contact_shares(motion).values())
-    change = float(motion.energy[-1] - motion.energy[0])
-    assert total == pytest.approx(change, abs=1e-6 * float(motion.energy[0]))
+    assert ("friction took" in text) == (shares == 2)
