@@ -54,7 +54,7 @@ def bent(
     places: np.ndarray,
     a: np.ndarray,
     k: np.ndarray,
-    force: Callable[[np.ndarray], np.ndarray] | None = None,
+    force: Callable[..., np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Deviation D (B, F, n) [m] of B flights by drag at times x (F,), D' at both ends
     (B, 2, n).
@@ -68,7 +68,7 @@ def bent(
         places: there (B, 2, n).
         a: acceleration without drag (B, n).
         k: drag (B,) [1/m].
-        force: f, of velocities (..., n); None: none.
+        force: f, of velocities (B, N, n), times (B, N) and ends (B, 2) of flights.
 
     Raises:
         ValueError: drag bends flights too much for the iteration.
@@ -77,13 +77,14 @@ def bent(
     chord = np.diff(places, axis=1)
     # velocity of the arc at the points
     arc = chord / h + a[:, None] * h / 2 * _POINTS[:, None]
+    times = tau.mean(axis=1)[:, None] + h[:, :, 0] / 2 * _POINTS
     slowing = np.zeros_like(arc)
     length = np.abs(arc).max() * h.max()
     for _ in range(ROUNDS):
         v = arc + h / 2 * (_RATES @ slowing)
         new = -k[:, None, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
         if force is not None:
-            new = new + force(v)
+            new = new + force(v, times, tau)
         moved = np.abs(new - slowing).max() * h.max() ** 2
         slowing = new
         if not SETTLED * length < moved < DIVERGED * length:
@@ -108,7 +109,7 @@ def bent_slopes(
     places: np.ndarray,
     a: np.ndarray,
     k: float,
-    force: Callable[[np.ndarray], np.ndarray] | None = None,
+    force: Callable[..., np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (F, n, P) of D and (2, n, P) of D' at the ends of one flight.
 
@@ -138,10 +139,10 @@ def bent_slopes(
 
 
 def straightened(
-    t: np.ndarray, q: np.ndarray, air: Callable[[np.ndarray], np.ndarray]
+    t: np.ndarray, q: np.ndarray, air: Callable[..., np.ndarray]
 ) -> np.ndarray:
-    """Places (T, n) [m] as they were without the acceleration `air(v)`:
-    `q - int int air(v)`.
+    """Places (T, n) [m] as they were without the acceleration `air(v, t)`:
+    `q - int int air(v, t)`.
 
     Up to lines. Velocities are those over four frames: good enough to find flights;
     near an impact they are wrong, but only for two frames.
@@ -151,7 +152,7 @@ def straightened(
     low = np.maximum(frames - 2, 0)
     high = np.minimum(frames + 2, len(t) - 1)
     v = (whole[high] - whole[low]) / (t[high] - t[low])[:, None]
-    faster = cumulative_trapezoid(air(v), t, axis=0, initial=0)
+    faster = cumulative_trapezoid(air(v, t), t, axis=0, initial=0)
     return q - cumulative_trapezoid(faster, t, axis=0, initial=0)
 
 

@@ -90,6 +90,13 @@ class Verdict:
     within_errors: int
     bends: int
 
+    def of_flights(self, kept: Sequence[bool]) -> "Verdict":
+        """That of some flights, as others lie in a contact; all where none is kept."""
+        if not any(kept):
+            return self
+        flights = [some for some, stays in zip(self.flights, kept) if stays]
+        return replace(self, flights=flights, bent=self.bent[np.array(kept)])
+
 
 def price_of_bend(frames: int) -> float:
     """Price of an acceleration of a flight's own in one coordinate: `ln T`, and

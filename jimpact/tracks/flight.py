@@ -10,7 +10,8 @@ import numpy as np
 from jimpact.tracks.drag import bent, bent_slopes, straightened
 from jimpact.tracks.frames import Frames
 
-Force = Callable[[np.ndarray], np.ndarray]  # acceleration (..., n) of velocity (..., n)
+# Acceleration (..., n) of velocity (..., n) at times (...), of flights with these ends.
+Force = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Flight:
     """Accelerations of all flights: `a - k |v| v + f(v)`.
 
     Fields: acceleration a (n,), `unknown` (n,) where it is to be found; drag k [1/m],
-    and whether it is unknown; `force` f, of velocities (..., n); None: none.
+    and whether it is unknown; `force` f, of velocities (..., n) and times; None: none.
     """
 
     acceleration: np.ndarray
@@ -59,12 +60,14 @@ class Flight:
     def air(self, drag: float) -> Force:
         """Acceleration that velocity makes, at a drag: `f(v) - k |v| v`."""
 
-        def accelerations(v: np.ndarray) -> np.ndarray:
-            """Acceleration (..., n) of velocities (..., n)."""
+        def accelerations(
+            v: np.ndarray, t: np.ndarray, ends: np.ndarray | None = None
+        ) -> np.ndarray:
+            """Acceleration (..., n) of velocities (..., n) at times (...)."""
             slowing = -drag * np.linalg.norm(v, axis=-1, keepdims=True) * v
             if self.force is None:
                 return slowing
-            return slowing + self.force(v)
+            return slowing + self.force(v, t, ends)
 
         return accelerations
 

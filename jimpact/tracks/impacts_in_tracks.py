@@ -25,6 +25,7 @@ from jimpact.tracks.judging import (
 from jimpact.tracks.poses import with_turns
 from jimpact.tracks.quaternions import as_inertia, as_poses
 from jimpact.tracks.search import Settings, doubts, fitted_arcs, searched, windowed
+from jimpact.tracks.spin import Spin, spin_of
 from jimpact.tracks.track import Track, TrackImpact
 from jimpact.tracks.turning_alone import with_impacts_of_turning
 
@@ -44,6 +45,7 @@ def find_impacts(
     units: str | Sequence[str] | None = None,
     quaternion: str | None = None,
     inertia: Any = None,
+    spin: Any = None,
 ) -> Track:
     """The impacts of a track: instants, velocities before and after, and their
     covariance.
@@ -85,6 +87,10 @@ def find_impacts(
             of mass, up to a factor: between impacts it turns freely. None: as a sphere
             or a cube does.
 
+        spin: angular velocity (3,), or (T, 3) in each frame, NaN where it is not
+            known [rad/s]; `acceleration` is then a function of velocities (.., n) and
+            spins (.., 3), as of Magnus: `lambda v, w: g + k * np.cross(w, v)`.
+
     Returns:
         `Track`, which prints and plots; `warnings` say which flights are not ballistic,
         which impacts are doubtful, and that no impact was found; `candidates` how many
@@ -112,6 +118,7 @@ def find_impacts(
             "shortest": shortest,
             "window": window,
             "units": units,
+            "spin": spin,
         }
         return _in_poses(t, q, sigma, acceleration, quaternion, inertia, options)
     t, q, names = _checked(t, q, shortest, units)
@@ -127,7 +134,7 @@ def find_impacts(
     check_values("contact", np.asarray(contact, float), low=0.0)
     if window is not None:
         check_values("window", np.asarray(window, float), low=0.0, open_low=True)
-    flight = _model(acceleration, drag, names)
+    flight = _model(acceleration, drag, names, spin_of(t, spin))
     angles = tuple(name == "rad" for name in names)
     frames = Frames(t - t.mean(), q, given, angles)
     settings = Settings(sigma is None, contact, shortest, window)
@@ -158,14 +165,21 @@ def acceleration_is_known(flight: Flight) -> bool:
     return not flight.unknown.all() and bool(flight.acceleration.any())
 
 
-def _model(acceleration: Any, drag: float | None, units: tuple[str, ...]) -> Flight:
+def _model(
+    acceleration: Any, drag: float | None, units: tuple[str, ...], spin: Spin | None
+) -> Flight:
     """Checked model of flights from the arguments of `find_impacts`."""
+    if spin is not None and not callable(acceleration):
+        raise ValueError(
+            "Argument `acceleration` must be a function of velocity and spin where "
+            f"`spin` is given, but is {acceleration!r}."
+        )
     n = len(units)
     none = np.zeros(n, bool)
     force = None
     unknown = none
     if callable(acceleration):
-        force = _checked_force(acceleration, n)
+        force = _checked_force(acceleration, n, spin)
         known = np.zeros(n)
     elif acceleration is None:
         known = np.zeros(n)
@@ -187,17 +201,26 @@ def _model(acceleration: Any, drag: float | None, units: tuple[str, ...]) -> Fli
     return Flight(known, unknown, drag or 0.0, drag is None, force)
 
 
-def _checked_force(function: Any, n: int) -> Force:
-    """Acceleration (..., n) as a function of velocity (..., n), by one trial."""
-    found = np.asarray(function(np.zeros((2, n))), float)
+def _checked_force(function: Any, n: int, spin: Spin | None) -> Force:
+    """Acceleration (..., n) as a function of velocity and time, by one trial.
+
+    Of velocities alone, or of velocities and the spin (..., 3) that is given.
+    """
+
+    def force(v: np.ndarray, t: np.ndarray, ends: np.ndarray | None) -> np.ndarray:
+        """Acceleration of velocities (..., n) at times (...)."""
+        if spin is None:
+            return np.asarray(function(v), float)
+        return np.asarray(function(v, spin.at(t, ends)), float)
+
+    found = force(np.zeros((2, n)), np.zeros(2), None)
     if found.shape != (2, n) or not np.isfinite(found).all():
         raise ValueError(
             f"Argument `acceleration`, a function of velocities (..., {n}), must "
-            f"return finite "
-            f"accelerations of the same shape, but of zeros ({2}, {n}) returns "
-            f"{found.tolist()}."
+            f"return finite accelerations of the same shape, but of zeros ({2}, {n}) "
+            f"returns {found.tolist()}."
         )
-    return lambda v: np.asarray(function(v), float)
+    return force
 
 
 def _in_poses(

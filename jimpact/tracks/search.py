@@ -193,7 +193,6 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
     for _ in range(ROUNDS):
         straight = flight.straight(frames)
         flights = divided(straight, flight.acceleration, settings.shortest).flights
-        flights = [f for f in flights if np.ptp(frames.t[f]) > settings.contact]
         if flights or not settings.estimated:
             break
         frames = frames.with_sigma(LARGER * frames.sigma)
@@ -207,6 +206,9 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
         )
     free = free_flights(straight, flight.acceleration, flights)
     verdict = judged(straight, free, flight, settings.estimated)
+    verdict = verdict.of_flights(
+        [np.ptp(frames.t[f]) > settings.contact for f in verdict.flights]
+    )
     return Search(frames, flight, settings, flights, verdict)
 
 

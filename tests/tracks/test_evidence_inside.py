@@ -283,3 +283,38 @@ def test_the_time_grows_as_the_frames():
     q = q + 1e-4 * np.random.default_rng(13).normal(size=t.size)
     track = ji.tracks.find_impacts(t, q)
     np.testing.assert_allclose([x.time for x in track.impacts], instants, atol=1e-3)
+
+
+def test_measured_spin_bends_flights_by_magnus():
+    """Spin of each frame, which an impact changes, with a force of velocity and spin."""
+    rng = np.random.default_rng(31)
+    spins = {False: np.array([0.0, 0.0, 90.0]), True: np.array([0.0, 0.0, 40.0])}
+
+    def air(v, w):
+        return np.array([0.0, -G, 0.0]) + 0.008 * np.cross(w, v)
+
+    place = np.array([0.0, 0.5, 0.0])
+    v = np.array([2.0, -1.0, 0.0])
+    places = []
+    before = after = None
+    for k in range(8000):
+        if k == 4050:
+            before = v.copy()
+            after = v = v * [0.8, -0.7, 1.0]
+        if k % 100 == 0:
+            places.append(place)
+        w = spins[k >= 4050]
+        middle = v + air(v, w) * 2.5e-5
+        place = place + middle * 5e-5
+        v = v + air(middle, w) * 5e-5
+    t = np.arange(80) * 5e-3
+    q = np.array(places) + 2e-4 * rng.normal(size=(80, 3))
+    spin = np.array([spins[x >= 0.2025] for x in t])
+    spin[5] = np.nan
+    track = ji.tracks.find_impacts(t, q, 2e-4, acceleration=air, spin=spin)
+    (impact,) = track.impacts
+    assert np.abs(errors(impact, before, after)).max() < 4
+    with pytest.raises(ValueError, match="function of velocity and spin"):
+        ji.tracks.find_impacts(t, q, acceleration=[0, -G, 0], spin=spin)
+    with pytest.raises(ValueError, match=r"shape \(3,\) or \(80, 3\)"):
+        ji.tracks.find_impacts(t, q, acceleration=air, spin=spin[:5])

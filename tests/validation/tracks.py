@@ -1,4 +1,4 @@
-"""The tables of docs/from_the_camera.md: `python tests/validation/tracks.py`, in six minutes.
+"""Figures of docs/from_the_camera.md and docs/recordings.md: `python tests/validation/tracks.py`, in six minutes.
 
 Of a ball that falls from half a metre: bias, scatter, stated error and coverage of e against the
 bound of Cramer and Rao, what people usually do, what goes wrong with cameras and how often it is
