@@ -136,8 +136,8 @@ def _in_slots(
         """True while an impact goes on or waits."""
         return jnp.any(goes_on(s.flow, s.carry)) | (s.following < count)
 
-    first = jnp.arange(size, dtype=jnp.int32)
-    flow_of_slots, carry_of_slots = picked((flow, carry), first)
+    impact = jnp.arange(size, dtype=jnp.int32)
     following = jnp.asarray(size, jnp.int32)
-    slots = _Slots(first, following, flow_of_slots, carry_of_slots, carry)
-    return stored(while_loop(open_work, next_round, slots))
+    first = jax.tree.map(lambda x: x[..., :size], (flow, carry))
+    slots = _Slots(impact, following, *first, carry)
+    return while_loop(open_work, next_round, slots).ends
