@@ -138,6 +138,6 @@ def _in_slots(
 
     impact = jnp.arange(size, dtype=jnp.int32)
     following = jnp.asarray(size, jnp.int32)
-    first = jax.tree.map(lambda x: x[..., :size], (flow, carry))
-    slots = _Slots(impact, following, *first, carry)
+    flow_of_slots, carry_of_slots = jax.tree.map(lambda x: x[..., :size], (flow, carry))
+    slots = _Slots(impact, following, flow_of_slots, carry_of_slots, carry)
     return while_loop(open_work, next_round, slots).ends
