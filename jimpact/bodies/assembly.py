@@ -457,8 +457,7 @@ class Bodies(RigidBodies):
         if least < -float(self.overlap):
             warnings.warn(
                 f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals "
-                f"mean little "
-                "there.",
+                f"mean little there.",
                 stacklevel=2,
             )
         if not pairs.filled:
@@ -469,8 +468,7 @@ class Bodies(RigidBodies):
         if pairs.overflows:
             raise ValueError(
                 f"Argument `q` must hold at most {self.room} contacts (the argument "
-                f"`room` of "
-                "`Bodies`), but holds more."
+                f"`room` of `Bodies`), but holds more."
             )
         listed = listed_pairs(pairs, self.mass)
         if not listed.directions[:, 0].any(axis=(1, 2)).all():
@@ -528,20 +526,17 @@ def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
             if not isinstance(body, RigidBody):
                 raise TypeError(
                     f"Argument `{name}` must hold bodies with contact points "
-                    f"(`RigidBody`), but "
-                    f"holds one of type {kind}."
+                    f"(`RigidBody`), but holds one of type {kind}."
                 )
             if body.dimension != bodies[0].dimension:
                 raise TypeError(
                     f"Argument `{name}` must hold planar bodies, or bodies in space "
-                    f"only, but "
-                    f"holds a {kind}."
+                    f"only, but holds a {kind}."
                 )
             if not body.points.shape[1]:
                 raise TypeError(
                     f"Argument `{name}` must hold bodies with contact points, but "
-                    f"holds a {kind} "
-                    "with round rims: give it `corners`."
+                    f"holds a {kind} with round rims: give it `corners`."
                 )
 
 
@@ -580,22 +575,18 @@ def _as_pairs(
                 fixed = ""
             raise ValueError(
                 f"Argument `pairs` must join different bodies, bodies 0 to "
-                f"{count - 1}{fixed}, but "
-                f"holds {pair!r}."
+                f"{count - 1}{fixed}, but holds {pair!r}."
             )
         for i in pair:
             if not (shapes[i].faces or shapes[i].is_round):
                 raise ValueError(
-                    "Argument `pairs` must join discs, polygons, spheres and boxes, "
-                    "but body "
-                    f"{i} is a {type(every[i]).__name__}."
+                    f"Argument `pairs` must join discs, polygons, spheres and boxes, "
+                    f"but body {i} is a {type(every[i]).__name__}."
                 )
         if d == 3 and all(shapes[i].faces for i in pair):
             raise ValueError(
                 f"Argument `pairs` must leave out the pair {tuple(pair)!r}: two boxes "
-                f"have no gap "
-                "function. Contacts of boxes come from `jimpact.from_mujoco`, in "
-                "motion at each "
-                "step (docs/mujoco.md)."
+                f"have no gap function. Contacts of boxes come from "
+                f"`jimpact.from_mujoco`, in motion at each step (docs/mujoco.md)."
             )
     return tuple((int(i), int(j)) for i, j in pairs)

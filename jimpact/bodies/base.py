@@ -327,9 +327,8 @@ class Body(eqx.Module):
         f = parts.gaps
         if f.ndim != 1 or f.size == 0:
             raise ValueError(
-                "Argument `gap_function` must return shape (m,), a gap for each of m "
-                ">= 1 contacts "
-                f"of {type(self).__name__}, but it returns {f.shape}."
+                f"Argument `gap_function` must return shape (m,), a gap for each of m "
+                f">= 1 contacts of {type(self).__name__}, but it returns {f.shape}."
             )
         check_range("q", self, parts.margin)
         noise = precision(f.dtype).noise * jnp.maximum(1.0, jnp.abs(q).max())
@@ -425,8 +424,8 @@ def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
     if not is_traced(margin) and not float(margin) >= 0:
         raise ValueError(
             f"Argument `{name}` must be in the range of the gap function "
-            f"({body.range_in_words}), "
-            f"but its margin `valid({name})` has value {float(margin):g}{where}."
+            f"({body.range_in_words}), but its margin `valid({name})` has value "
+            f"{float(margin):g}{where}."
         )
 
 
@@ -442,8 +441,7 @@ def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
     worst = int(np.argmin(f))
     raise ValueError(
         f"Argument `{name}` must have no penetration (f >= -{float(closed_below):g} "
-        f"m), "
-        f"but gap {worst} has value {float(f[worst]):g} m."
+        f"m), but gap {worst} has value {float(f[worst]):g} m."
     )
 
 

@@ -183,14 +183,12 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
         raise TypeError(
             f"Arguments `model` and `data` must be a mujoco.MjModel and its MjData, "
-            f"but are of "
-            f"types {type(model).__name__} and {type(data).__name__}."
+            f"but are of types {type(model).__name__} and {type(data).__name__}."
         )
     if data.qpos.shape != (model.nq,) or data.qvel.shape != (model.nv,):
         raise ValueError(
             f"Argument `data` must be of this model, with {model.nq} positions and "
-            f"{model.nv} "
-            f"velocities, but has {data.qpos.size} and {data.qvel.size}."
+            f"{model.nv} velocities, but has {data.qpos.size} and {data.qvel.size}."
         )
     check_values("margin", as_float_array("margin", margin), low=0.0)
     check_values("data.qpos", data.qpos)
@@ -211,8 +209,7 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     if not contacts and not limits:
         raise ValueError(
             "Argument `data` must have a contact that can move, but has none: no geoms "
-            "touch at "
-            "data.qpos. Argument `margin` finds contacts before they close."
+            "touch at data.qpos. Argument `margin` finds contacts before they close."
         )
     names = tuple(
         (
@@ -287,8 +284,7 @@ def _contacts(
         if min(contact.geom) < 0:
             raise ValueError(
                 "Argument `data` must have contacts of rigid bodies only, but has one "
-                "of a "
-                "flexible body (flex)."
+                "of a flexible body (flex)."
             )
         first, second = (
             _point_jacobian(mujoco, model, data, contact, g) for g in contact.geom
@@ -347,9 +343,8 @@ def _friction(contacts: list[Any], names: tuple[str, ...]) -> np.ndarray:
             turning.append(repr(name))
     if unequal:
         warnings.warn(
-            "Friction differs in two directions, and the first one is taken for both, "
-            "at "
-            f"{_in_words(unequal)}.",
+            f"Friction differs in two directions, and the first one is taken for both, "
+            f"at {_in_words(unequal)}.",
             stacklevel=3,
         )
     if turning:

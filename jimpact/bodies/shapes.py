@@ -633,8 +633,7 @@ def _round_shape(
         ):
             raise ValueError(
                 f"Argument `centre` must be at most {float(radius):g} m from the "
-                f"middle, but has "
-                f"value {(-middle).tolist()}."
+                f"middle, but has value {(-middle).tolist()}."
             )
     return Shape((0,), 1, faces=False, centred=isotropic and centre is None), middle
 
@@ -683,9 +682,8 @@ def _moments_in_space(value: Any) -> jax.Array:
     moments = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
     if moments[2] > (1 + _SLACK) * (moments[0] + moments[1]):
         raise ValueError(
-            "Argument `inertia` must have principal moments none of which is more than "
-            "the sum of "
-            f"the others, but has {moments.tolist()}."
+            f"Argument `inertia` must have principal moments none of which is more "
+            f"than the sum of the others, but has {moments.tolist()}."
         )
     return inertia
 
@@ -711,8 +709,7 @@ def _around(corners: jax.Array) -> tuple[int, ...]:
         worst = int(bad[0] + 1) % k
         raise ValueError(
             f"Argument `corners` {_CONVEX}, but it does not turn the same way at "
-            f"corner {worst}, "
-            f"{c[worst].tolist()}."
+            f"corner {worst}, {c[worst].tolist()}."
         )
     if abs(abs(turn.sum()) - 2 * np.pi) > _FULL_TURN:
         raise ValueError(

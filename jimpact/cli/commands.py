@@ -46,11 +46,9 @@ GLOSSARY = {
     ),
     r"\(bound\)": "(bound): the fit ended at a bound of the parameter's range.",
     r"\bAICc\b": "AICc: Akaike's information criterion, misfit against number of "
-    "parameters; lower "
-    "is better, differences below 2 mean little.",
+    "parameters; lower is better, differences below 2 mean little.",
     r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they "
-    "conserve "
-    "momentum.",
+    "conserve momentum.",
     r"\baccumulation\b": "Accumulation: infinitely many impacts in a finite time.",
     r"\d friction\b": "Friction: a contact begins to stick or to slip.",
     r"\bparoxysm\b": (
@@ -144,8 +142,8 @@ def _impact_of(
         if separates.all() and "initial_energy" not in study.parameters:
             raise ValueError(
                 "--velocity must let bodies approach each other, but no contact "
-                "closes: there is "
-                "no impact (positive velocities of a chain point to the right)."
+                "closes: there is no impact (positive velocities of a chain point to "
+                "the right)."
             )
         return study, before, None
     data = study.experiments
@@ -632,15 +630,13 @@ def _advise_parameters(study: Study) -> dict[str, Any]:
     if rheology != "bistiffness":
         raise ValueError(
             f"the study must have bistiffness contacts, but has rheology {rheology!r}: "
-            f"only the "
-            "compliant law handles viscous contacts."
+            f"only the compliant law handles viscous contacts."
         )
     for key in _ADVISE_REFUSED:
         if np.any(study.parameters.get(key, 0.0)):
             raise ValueError(
                 f"the study must not have `{key}`, but has {study.parameters[key]}: "
-                f"`jimpact "
-                "advise` compares laws without it."
+                f"`jimpact advise` compares laws without it."
             )
     return {
         key: value

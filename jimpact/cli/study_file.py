@@ -69,8 +69,7 @@ def read_tables(path: Path) -> dict[str, Any]:
         if path.suffix == ".csv":
             raise ValueError(
                 "a study must be a TOML file, but this is a CSV file. `jimpact new fit "
-                "my_fit` "
-                "writes a study; name this file under [data] in it."
+                "my_fit` writes a study; name this file under [data] in it."
             ) from None
         raise ValueError(
             f"the study must be a TOML file: {_position(error)}."

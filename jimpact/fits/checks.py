@@ -297,8 +297,7 @@ def _left_out(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "left_out",
             f"Left out: {count} ({listed(labels)}), whose impacts fail, or whose "
-            f"derivatives "
-            "cannot be used.",
+            f"derivatives cannot be used.",
             f"{count} are left out",
             labels,
         )
@@ -321,12 +320,10 @@ def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
         labels = tuple(data.shots[k] for k in unknown)
         yield Finding(
             "unknown_correction",
-            f"The fit weighs shots {listed(labels)} as if they were not "
-            "corrected: they have `lost_freedom`, but do not conserve momentum, so "
-            "that the errors "
-            "that `sigma_pre` leaves in them are unknown; chi^2 and standard errors "
-            "are "
-            "approximate.",
+            f"The fit weighs shots {listed(labels)} as if they were not corrected: "
+            f"they have `lost_freedom`, but do not conserve momentum, so that the "
+            f"errors that `sigma_pre` leaves in them are unknown; chi^2 and standard "
+            f"errors are approximate.",
             shots=labels,
         )
 
@@ -339,8 +336,7 @@ def _search(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "kink",
             "The minimum is a kink of the law (the sequence of contacts changes there, "
-            "or its "
-            "derivatives are wrong): standard errors do not hold.",
+            "or its derivatives are wrong): standard errors do not hold.",
         )
     if not judged.solution.converged:
         yield Finding(
@@ -383,8 +379,7 @@ def _matrix(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "matrix_edge",
             f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): "
-            f"the errors "
-            "hold for the side inside.",
+            f"the errors hold for the side inside.",
         )
     if data is None or not isinstance(law, RestitutionMatrix):
         return
@@ -392,8 +387,8 @@ def _matrix(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "matrix_free",
             "Nothing keeps this matrix consistent for other approach velocities than "
-            "the measured: "
-            "the conditions are for (m, m) matrices with admissible=True.",
+            "the measured: the conditions are for (m, m) matrices with "
+            "admissible=True.",
         )
 
 
@@ -410,8 +405,7 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
             "law_fails",
             f"The fitted law fails in {len(which)} of {values} values "
             f"({listed([str(i + 1) for i in which])}): they are not finite there and "
-            f"count as "
-            "large errors.",
+            f"count as large errors.",
         )
 
 
@@ -427,11 +421,9 @@ def _above_sigma(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma "
-            f"allows (chi^2 = "
-            f"{judged.squares:.4g} with {degrees(judged.freedom)}): the law or "
-            "the stated errors are wrong, or the parameters scatter; the standard "
-            "errors "
-            f"{how}.{_held_notes(judged.problem)}",
+            f"allows (chi^2 = {judged.squares:.4g} with {degrees(judged.freedom)}): "
+            f"the law or the stated errors are wrong, or the parameters scatter; the "
+            f"standard errors {how}.{_held_notes(judged.problem)}",
             numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
 
@@ -460,9 +452,8 @@ def _held_notes(problem: FitProblem) -> str:
         if contacts > 1:
             one_each = ", ".join(["1"] * contacts)
             notes.append(
-                " The law's `stiffness` is one number, held: give it one for each "
-                "contact, "
-                f"`stiffness=[{one_each}]`, to fit their ratios."
+                f" The law's `stiffness` is one number, held: give it one for each "
+                f"contact, `stiffness=[{one_each}]`, to fit their ratios."
             )
     return "".join(notes)
 
@@ -489,10 +480,9 @@ def _above_pure_error(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that "
-            f"momentum "
-            f"and repeated shots show ({law_freedom} and {degrees(error_freedom)}): "
-            f"the law does "
-            f"not fit, and the standard errors mean little.{_held_notes(problem)}",
+            f"momentum and repeated shots show ({law_freedom} and "
+            f"{degrees(error_freedom)}): the law does not fit, and the standard errors "
+            f"mean little.{_held_notes(problem)}",
             numbers={"ratio": float(np.sqrt(ratio))},
         )
 
@@ -541,8 +531,7 @@ def _linear_in_velocities(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals follow the velocities before the impact (F = "
-            f"{ratio:.3g} "
-            f"with {count} and {degrees(freedom)}): the law does not fit.",
+            f"{ratio:.3g} with {count} and {degrees(freedom)}): the law does not fit.",
             numbers={"F": ratio},
         )
 
@@ -569,8 +558,8 @@ def _contradicted_priors(judged: Judged) -> Iterator[Finding]:
             yield Finding(
                 "prior",
                 f"The data contradict the prior {name} = {prior.mean:g} ± "
-                f"{prior.std:g}: what they "
-                f"say without it is {far:.2g} standard errors off.",
+                f"{prior.std:g}: what they say without it is {far:.2g} standard errors "
+                f"off.",
                 f"the prior of {name} contradicts the data",
                 numbers={name: far},
             )
@@ -611,8 +600,7 @@ def _suspicious(judged: Judged) -> Iterator[Finding]:
     yield Finding(
         "suspicious",
         f"Suspicious: {shots}, which the others do not expect (of {count}); look there "
-        f"for "
-        f"errors{advice}.",
+        f"for errors{advice}.",
         f"{shots} {are} suspicious",
         tuple(label for _, label in suspects),
     )
@@ -668,8 +656,7 @@ def _units(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "mixed_units",
             "Without sigma, velocities in rad/s weigh like those in m/s of the same "
-            "kinetic "
-            "energy.",
+            "kinetic energy.",
         )
 
 
@@ -688,8 +675,7 @@ def _at_bounds(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "at_bound",
             f"{name} is at its {end} bound {value:g}; its standard error only holds "
-            f"towards "
-            f"{towards} values.",
+            f"towards {towards} values.",
             numbers={name: value},
         )
 
@@ -713,8 +699,7 @@ def _choices(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "undetermined",
             f"The data determine {rank} of {counted(count, 'parameter')} (rank {rank} "
-            f"of {count}); "
-            "the values given are one choice of many.",
+            f"of {count}); the values given are one choice of many.",
             numbers={"rank": rank, "parameters": count},
         )
     elif several > 1:
@@ -733,16 +718,14 @@ def _unknown_errors(judged: Judged) -> Iterator[Finding]:
             "unknown_errors",
             (
                 "No degree of freedom is left to estimate the noise: errors are "
-                "unknown "
-                "without sigma."
+                "unknown without sigma."
             ),
         )
     elif judged.solution.starts[0].sum_of_squares <= judged.problem.exact_squares:
         yield Finding(
             "unknown_errors",
             "The data are reproduced to the last digit and do not show their noise: "
-            "errors are "
-            "unknown without `sigma` or `resolution`.",
+            "errors are unknown without `sigma` or `resolution`.",
         )
 
 

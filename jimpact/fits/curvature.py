@@ -87,9 +87,8 @@ def bent_within_errors(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "bent",
             f"The law bends within the errors of v-, which moves {', '.join(parts)}: "
-            f"measure v- "
-            "better, or state `sigma_pre` = 0 where they are exact, as of bodies at "
-            "rest.",
+            f"measure v- better, or state `sigma_pre` = 0 where they are exact, as of "
+            f"bodies at rest.",
             "the law bends within the errors of v-",
             numbers={names[i]: float(size[i]) for i in np.flatnonzero(worth)},
         )

@@ -301,8 +301,7 @@ def _units(data: DataBalances) -> Iterator[Finding]:
             yield Finding(
                 "units",
                 f"Units? The {what} after is {plainly} times that before: {unit} in "
-                f"one of the "
-                "columns?",
+                f"one of the columns?",
                 "the units are suspect",
                 numbers={"ratio": ratio, "factor": factor},
             )
@@ -402,10 +401,9 @@ def _copies(data: DataBalances) -> Iterator[Finding]:
         yield Finding(
             "copies",
             f"{f'All {total}' if every else f'{count} of {total}'} shots are equal to "
-            f"the last "
-            "digit, but for a factor: they carry no more information than one of them, "
-            "and none "
-            "on the noise; without `sigma` or `resolution` the errors are meaningless.",
+            f"the last digit, but for a factor: they carry no more information than "
+            f"one of them, and none on the noise; without `sigma` or `resolution` the "
+            f"errors are meaningless.",
             f"{'the' if every else f'{count} of'} {total} shots are copies of one",
             data.labels(np.flatnonzero(same)),
         )

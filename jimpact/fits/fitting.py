@@ -148,8 +148,8 @@ def fit(
         if free is not DEFAULT_FREE or any(each is not None for each in others):
             raise ValueError(
                 "Arguments `scene`, `experiments`, `free`, `bounds`, `priors` and "
-                "`ties` must be "
-                "left out where a FitProblem is given, which holds its own."
+                "`ties` must be left out where a FitProblem is given, which holds its "
+                "own."
             )
         problem = law
     else:

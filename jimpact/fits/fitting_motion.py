@@ -173,8 +173,7 @@ def fit_motion(
         if begin.ndim not in (1, 2) or begin.shape[:-1] != q0.shape[:-1]:
             raise ValueError(
                 f"Argument `{name}` must have shape (n,), or (K, n) as that of the "
-                f"other, "
-                f"but has shape {begin.shape}."
+                f"other, but has shape {begin.shape}."
             )
     if observe is None:
         shape = (*q0.shape[:-1], "S", q0.shape[-1])

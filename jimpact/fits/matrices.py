@@ -345,17 +345,16 @@ def matrix_region(
     for name, kind in zip(_FACES, _kinds(region)):
         if slack[kind].min() < -_rounding(region):
             raise ValueError(
-                "Argument `law` must start from an admissible matrix, consistent for "
-                "all approach "
-                f"velocities, but {name} fails by {-slack[kind].min():.3g}. "
-                "RestitutionMatrix(matrix, admissible=False) is fitted without that."
+                f"Argument `law` must start from an admissible matrix, consistent for "
+                f"all approach velocities, but {name} fails by "
+                f"{-slack[kind].min():.3g}. RestitutionMatrix(matrix, "
+                f"admissible=False) is fitted without that."
             )
     center = _inner_point(region, start)
     if center is None:
         raise ValueError(
             "Argument `free` must leave an admissible choice: with the fixed entries "
-            "every "
-            "free entry is at the edge already."
+            "every free entry is at the edge already."
         )
     return eqx.tree_at(lambda r: r.center, region, jnp.asarray(center, dtype))
 
@@ -383,8 +382,8 @@ def admissible_start(scenes: list[Scene]) -> Float[np.ndarray, "m m"]:
     if e is None:
         raise ValueError(
             "Argument `scene` must have an admissible restitution matrix to start "
-            "from, but none "
-            "was found: give one, or RestitutionMatrix(matrix, admissible=False)."
+            "from, but none was found: give one, or RestitutionMatrix(matrix, "
+            "admissible=False)."
         )
     return e.reshape(m, m)
 
@@ -404,9 +403,8 @@ def _region(
     if m > LARGEST:
         raise ValueError(
             f"Argument `law` must have at most {LARGEST} contacts to keep its matrix "
-            f"admissible, "
-            f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted "
-            f"without that."
+            f"admissible, but has {m}. RestitutionMatrix(matrix, admissible=False) is "
+            f"fitted without that."
         )
     distinct = np.unique([_inverse(scene) for scene in scenes], axis=0)
     arrays: Any = (origin, mix, distinct[:, :m], distinct[:, m], bounds, center)
@@ -433,10 +431,9 @@ def _inverse(scene: Scene) -> Float[np.ndarray, "rows m"]:
     smallest = np.linalg.eigvalsh(g)[0]
     if smallest < _REDUNDANT * len(g) * np.finfo(g.dtype).eps:
         raise ValueError(
-            "Argument `scene` must have no redundant contacts to keep a restitution "
-            "matrix "
-            f"admissible, but the smallest eigenvalue of G is {smallest:.3g}. "
-            "RestitutionMatrix(matrix, admissible=False) is fitted without that."
+            f"Argument `scene` must have no redundant contacts to keep a restitution "
+            f"matrix admissible, but the smallest eigenvalue of G is {smallest:.3g}. "
+            f"RestitutionMatrix(matrix, admissible=False) is fitted without that."
         )
     return np.vstack([np.linalg.inv(g), np.asarray(scene.closed, g.dtype)])
 

@@ -113,8 +113,7 @@ def tolerated(
         return law, ()
     line = (
         f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is "
-        f"computed with "
-        f"`rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give it an `rtol` to "
-        f"change that."
+        f"computed with `rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give "
+        f"it an `rtol` to change that."
     )
     return dataclasses.replace(law, **{"rtol": COARSE_RTOL}), (line,)

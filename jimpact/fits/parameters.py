@@ -85,8 +85,7 @@ def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
                 kind = "one value for all contacts"
             raise ValueError(
                 f"Argument `{argument}` must name entries that the field has, counted "
-                f"from 1, but "
-                f"has {name!r} of a field that is {kind}."
+                f"from 1, but has {name!r} of a field that is {kind}."
             )
     return [int(np.ravel_multi_index(index, shape)) for index in members]
 
@@ -166,12 +165,9 @@ def free_parameters(
         if shared.all():
             raise ValueError(
                 "Argument `free` must not hold a scalar `stiffness` (or one for all "
-                "contacts): "
-                "with equal exponents a common factor of all stiffnesses changes "
-                "nothing, so the "
-                "data cannot determine it. Give the law one stiffness per contact to "
-                "fit their "
-                "ratios, or free only `restitution`."
+                "contacts): with equal exponents a common factor of all stiffnesses "
+                "changes nothing, so the data cannot determine it. Give the law one "
+                "stiffness per contact to fit their ratios, or free only `restitution`."
             )
         labels["stiffness"][shared] = 0
         fixed = "stiffness[1]"
@@ -193,8 +189,7 @@ def free_parameters(
         )
     log = np.array([domain_of(law, entry_of(name)[0]).log for name in names])
     note = (
-        f"{fixed} is fixed at its start: with equal exponents only stiffness "
-        f"ratios "
+        f"{fixed} is fixed at its start: with equal exponents only stiffness ratios "
         f"matter."
     )
     ratios = fixed == "stiffness[1]"
@@ -271,8 +266,7 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
     if isinstance(value_of(law, field), (float, tuple)):
         return (
             f"Argument `free` must not hold `{field}`: it is a fixed number of this "
-            f"{name}; "
-            f"give {field}=jnp.asarray(...) to the law to make it a parameter."
+            f"{name}; give {field}=jnp.asarray(...) to the law to make it a parameter."
         )
     declared = declarations_of(type(law))
     if isinstance(declared.get(field), Domain):
@@ -295,8 +289,7 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
     if mask.dtype.kind not in "biu" or (mask < 0).any():
         raise ValueError(
             f"Argument `free` must map `{field}` to True, False, a boolean mask or "
-            f"numbers of "
-            f"groups (0 is fixed), but has value {choice!r}."
+            f"numbers of groups (0 is fixed), but has value {choice!r}."
         )
     if mask.shape not in ((), shape):
         kind = f"of shape {shape}"
@@ -309,8 +302,7 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
             )
         raise ValueError(
             f"Argument `free` must have a mask of shape {shape} for `{field}`, which "
-            f"is {kind} "
-            f"in this law, but has a mask of shape {mask.shape}.{advice}"
+            f"is {kind} in this law, but has a mask of shape {mask.shape}.{advice}"
         )
     if mask.dtype == bool:  # each free entry is a group of its own
         count = np.arange(1, np.prod(shape, dtype=int) + 1).reshape(shape)
@@ -392,8 +384,7 @@ def _bound_pair(field: str, pair: Any, law: Law) -> Limits:
     except (TypeError, ValueError):
         raise ValueError(
             f"Argument `bounds` must map `{field}` to (low, high), each a number or of "
-            f"shape "
-            f"{shape}, but has {pair!r}."
+            f"shape {shape}, but has {pair!r}."
         ) from None
     domain = domain_of(law, field)
     smallest, largest = domain.bounds
@@ -452,8 +443,7 @@ def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, 
     except (TypeError, ValueError):
         raise ValueError(
             f"Argument `priors` must map `{name}` to (mean, standard deviation) or a "
-            f"ji.Normal, "
-            f"but has {pair!r}."
+            f"ji.Normal, but has {pair!r}."
         ) from None
     if not (0 < std < np.inf):
         raise ValueError(
@@ -463,8 +453,7 @@ def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, 
     if not low <= mean <= high:
         raise ValueError(
             f"Argument `priors` must have its mean in [{low:g}, {high:g}] for "
-            f"`{name}`, but has "
-            f"{pair!r}."
+            f"`{name}`, but has {pair!r}."
         )
     return mean, std
 
@@ -558,8 +547,7 @@ def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
         if not callable(function):
             raise ValueError(
                 f"Argument `ties` must map `{name}` to a function of the other values, "
-                f"as in "
-                f"lambda p: 2 * p['restitution'], but has {function!r}."
+                f"as in lambda p: 2 * p['restitution'], but has {function!r}."
             )
         at = tuple(places("ties", name, _value(law, name).shape))
         tie = Tie(name, entry_of(name)[0], at, function)
@@ -578,8 +566,7 @@ def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
             low, high = domain.bounds
             raise ValueError(
                 f"Argument `ties` must keep `{tie.name}` in [{low:g}, {high:g}], but "
-                f"its function "
-                f"gives {value.tolist()} at the start."
+                f"its function gives {value.tolist()} at the start."
             )
     return checked
 
@@ -689,14 +676,12 @@ def with_parts_of_scene(
     if scene is None or own_scenes:
         raise ValueError(
             f"Argument `free` may name `{parts[0]}` only where all shots have one "
-            f"`scene`, but "
-            "they have scenes of their own."
+            f"`scene`, but they have scenes of their own."
         )
     if isinstance(law, RestitutionMatrix):
         raise ValueError(
             f"Argument `free` must not name `{parts[0]}` with a RestitutionMatrix, "
-            f"which is "
-            "admissible in one scene only."
+            f"which is admissible in one scene only."
         )
     planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
     if planar:
@@ -738,8 +723,7 @@ def limits_with_scene(
         if i not in prior_of:
             raise ValueError(
                 f"Argument `priors` must have (mean, standard deviation) for `{name}`, "
-                f"a part of "
-                "the scene that is fitted with the law."
+                f"a part of the scene that is fitted with the law."
             )
         _, mean, std = prior_of[i]
         low[i], high[i] = (
@@ -749,8 +733,7 @@ def limits_with_scene(
         if not low[i] <= start[i] <= high[i]:
             raise ValueError(
                 f"Argument `priors` must have a mean for `{name}` within {REACH:g} "
-                f"standard "
-                f"deviations of its value in the scene, {start[i]:g}, but has {mean:g} "
-                f"± {std:g}."
+                f"standard deviations of its value in the scene, {start[i]:g}, but has "
+                f"{mean:g} ± {std:g}."
             )
     return low, high

@@ -113,9 +113,8 @@ def with_parts_of_motion(
         else:
             where = ""
         raise ValueError(
-            "Argument `free` may name `floor` only of bodies over a floor at rest, but "
-            "the system "
-            f"is of a {type(system.body).__name__}{where}."
+            f"Argument `free` may name `floor` only of bodies over a floor at rest, "
+            f"but the system is of a {type(system.body).__name__}{where}."
         )
     values: dict[str, Any] = {"q0": q0, "v0": v0, "floor": jnp.zeros((), q0.dtype)}
     if "gravity" in wanted:
@@ -134,8 +133,7 @@ def _acceleration(system: System, q: jax.Array) -> jax.Array:
     """
     refused = ValueError(
         "Argument `free` may name `gravity` only of a system whose one potential is "
-        "its weight: "
-        "give it `gravity=`."
+        "its weight: give it `gravity=`."
     )
     if system.potential is None:
         raise refused

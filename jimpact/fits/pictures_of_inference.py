@@ -266,8 +266,7 @@ def _draws_of(fit: Fit, draws: Any) -> np.ndarray:
     if values.ndim != 2 or values.shape[1] != len(fit.names):
         raise ValueError(
             f"Argument `draws` must have shape (N, {len(fit.names)}), parameters of "
-            f"the fit, but "
-            f"has shape {values.shape}."
+            f"the fit, but has shape {values.shape}."
         )
     return values
 

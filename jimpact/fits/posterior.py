@@ -313,8 +313,7 @@ def _prior(
         if not low <= a < b <= high:
             raise ValueError(
                 f"Argument `priors` must lie in [{low:g}, {high:g}] for `{name}`, but "
-                f"has "
-                f"{chosen!r}."
+                f"has {chosen!r}."
             )
         return kinds.Uniform(a, b)
     if isinstance(chosen, Normal):
@@ -324,16 +323,14 @@ def _prior(
     if not isinstance(chosen, kinds.Distribution) or chosen.shape() != ():
         raise ValueError(
             f"Argument `priors` must map `{name}` to a ji.Uniform, a ji.Normal or a "
-            f"numpyro "
-            f"distribution of one number, but has {chosen!r}."
+            f"numpyro distribution of one number, but has {chosen!r}."
         )
     # what it can yield must lie in the domain: seen on a sample
     drawn = np.asarray(chosen.sample(jax.random.PRNGKey(0), (1000,)))
     if (drawn < low).any() or (drawn > high).any():
         raise ValueError(
             f"Argument `priors` must lie in [{low:g}, {high:g}] for `{name}`, but "
-            f"draws reach "
-            f"from {drawn.min():.3g} to {drawn.max():.3g}."
+            f"draws reach from {drawn.min():.3g} to {drawn.max():.3g}."
         )
     return chosen
 
@@ -346,8 +343,7 @@ def _warn(draws: Any, arviz: Any) -> None:
     if diverging:
         warnings.warn(
             f"{diverging} transitions diverged: the posterior has an edge or a kink "
-            f"that the "
-            "sampler did not resolve; its draws near there are too few.",
+            f"that the sampler did not resolve; its draws near there are too few.",
             stacklevel=3,
         )
     if draws.posterior.sizes["chain"] > 1:
@@ -355,7 +351,6 @@ def _warn(draws: Any, arviz: Any) -> None:
         if float(spread.max()) > MIXED:
             warnings.warn(
                 f"The chains disagree (r-hat up to {float(spread.max()):.3g}): draw "
-                f"more, or there "
-                "are several minima.",
+                f"more, or there are several minima.",
                 stacklevel=3,
             )

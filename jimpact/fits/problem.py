@@ -256,8 +256,7 @@ class FitProblem:
         if shape != post.shape:
             raise ValueError(
                 f"Argument `observe` must give values of shape {post.shape} like "
-                f"`measured`, "
-                f"but gives shape {shape}."
+                f"`measured`, but gives shape {shape}."
             )
         return problem
 
@@ -822,8 +821,8 @@ def _build(
     if priors and measurement.sigma is None:
         raise ValueError(
             "Argument `priors` must be left out where no `sigma` (or `resolution`) of "
-            "the measured "
-            "values is known: priors and data weigh against each other by their errors."
+            "the measured values is known: priors and data weigh against each other by "
+            "their errors."
         )
     fixed = entries(law, parameters.fields)
     mean, weight = np.zeros((2, len(fixed)))

@@ -192,8 +192,8 @@ def contour(
     if deviance.min() > limit:
         raise ValueError(
             f"Argument `points` must be larger: the region falls between {points} "
-            f"values of "
-            f"{first} and of {second} (or take `profile`, which needs no grid)."
+            f"values of {first} and of {second} (or take `profile`, which needs no "
+            f"grid)."
         )
     return Contour(
         names=(first, second),

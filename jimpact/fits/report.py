@@ -271,14 +271,12 @@ def _parameters(fit: "Fit") -> list[str]:
     if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:
         lines.append(
             f"With {degrees(freedom)}, a 95 % interval is {fit.quantile(0.95):.2g} "
-            f"standard errors "
-            "to each side (Student's t), not 1.96."
+            f"standard errors to each side (Student's t), not 1.96."
         )
     if fit.linearization_misleads and not fit.profiles:
         lines.append(
             "These intervals take the sum of squares for a parabola, which may mislead "
-            "here: "
-            "`ji.profile(fit)` does not."
+            "here: `ji.profile(fit)` does not."
         )
     return lines
 
@@ -336,8 +334,7 @@ def _quality(fit: "Fit") -> list[str]:
                 part = " (the factor is that of the residuals that are not momentum)"
             lines.append(
                 f"errors         standard errors multiplied by {fit.noise:.3g}, "
-                f"because chi^2 "
-                f"contradicts the stated sigma{part}"
+                f"because chi^2 contradicts the stated sigma{part}"
             )
     elif np.isfinite(fit.noise):
         lines.append(
@@ -422,8 +419,7 @@ def _minima(fit: "Fit") -> list[str]:
     lines = [
         (
             f"{total - lost} of {total} starts ended in {where}:  sum of squares, "
-            f"starts, "
-            f"values"
+            f"starts, values"
         )
     ]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
@@ -648,8 +644,7 @@ def load_fit(path: str | Path) -> "Fit":
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
             f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A "
-            f"law of your "
-            "own must be imported before."
+            f"law of your own must be imported before."
         ) from error
 
 

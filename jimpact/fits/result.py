@@ -317,8 +317,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
             raise ValueError(
                 f"Argument `shots` must have shape (K, {len(units)}), velocities of "
-                f"the bodies of "
-                f"the fit, but has shape {np.shape(data)}."
+                f"the bodies of the fit, but has shape {np.shape(data)}."
             )
         check_values("shots", data)
         data = Experiments(
@@ -327,8 +326,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         if isinstance(self.problem.law, LawInScene) and scene is not None:
             raise ValueError(
                 "Argument `scene` must be left out where parts of the scene were "
-                "fitted: they hold "
-                "for that of the fit only."
+                "fitted: they hold for that of the fit only."
             )
         if scene is None:
             common = self.problem.scene
@@ -371,8 +369,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
                 also = ""
             raise ValueError(
                 f"Argument `scene` must have {size} velocities as the fit{also}, but "
-                f"has "
-                f"{scene.size} and {scene.contacts}."
+                f"has {scene.size} and {scene.contacts}."
             )
 
     def _noise_of(self, sigma: Any) -> np.ndarray:

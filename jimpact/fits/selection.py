@@ -203,8 +203,7 @@ class NestedTest(NamedTuple):
             freedom = f"{self.more} and {degrees(rest)}"
         return (
             f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with "
-            f"{freedom}, "
-            f"p-value {self.chance:.2g} (needed: below {WORSE:g})."
+            f"{freedom}, p-value {self.chance:.2g} (needed: below {WORSE:g})."
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -253,9 +252,8 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     more = full.rank - simple.rank
     if more < 1:
         raise ValueError(
-            "Argument `full` must have more parameters that the data see than "
-            "`simple`, "
-            f"but has {full.rank} and {simple.rank}."
+            f"Argument `full` must have more parameters that the data see than "
+            f"`simple`, but has {full.rank} and {simple.rank}."
         )
     names = tuple(x for x in full.names if x not in simple.names) or full.names
     gain = max(simple.starts[0].sum_of_squares - full.starts[0].sum_of_squares, 0.0)
@@ -428,11 +426,9 @@ def _candidates(
     left_out = missing | left_out
     alternatives = {
         "compliant": "differs from lzb only where contacts have gaps, or open and "
-        "close again (as "
-        "at a wall): name it in `laws` to fit it, too",
+        "close again (as at a wall): name it in `laws` to fit it, too",
         "routh": "is moreau with one restitution, unless contacts separate beforehand: "
-        "name it in "
-        "`laws` to fit it, too",
+        "name it in `laws` to fit it, too",
     }
     if any(map(_opens_and_closes, scenes)):
         del alternatives["compliant"]

@@ -133,11 +133,9 @@ def _in_words(
     if len(parts) == 1:
         return (
             f"The data cannot see {taking_part[0]}: no measured {value_name} depends "
-            f"on it (to "
-            "first order)."
+            f"on it (to first order)."
         )
     return (
         f"The data cannot see a combination: no measured {value_name} changes (to "
-        f"first order) "
-        f"when {', '.join(parts[:-1])} and {parts[-1]} together."
+        f"first order) when {', '.join(parts[:-1])} and {parts[-1]} together."
     )

@@ -354,11 +354,9 @@ def _missing_stiffness(situation: Situation) -> str:
     if situation.gapped.any():
         named = ", ".join(str(j + 1) for j in np.flatnonzero(situation.gapped))
         return (
-            "Argument `stiffness` must be given [N/m^eta] where open contacts can "
-            "close while "
-            f"others are loaded (contact {named}): gaps count in units of the "
-            f"indentation. "
-            "Set their gaps to inf if they take no part."
+            f"Argument `stiffness` must be given [N/m^eta] where open contacts can "
+            f"close while others are loaded (contact {named}): gaps count in units of "
+            f"the indentation. Set their gaps to inf if they take no part."
         )
     return (
         "Argument `stiffness` must be given where exponents differ: ratios do not "

@@ -26,8 +26,7 @@ _PERCENT_FROM = 1e-4  # smaller errors are printed as 2e-05, not as 0.002 %
 ROUNDING = 1e-12  # errors up to this are printed as "rounding"
 _KNOWN = (  # where nothing was varied
     "The stiffnesses are taken as known. A range on their ratios tests whether that "
-    "matters: "
-    "`stiffness_range=(0.5, 2)`, `jimpact advise --stiffness-range 0.5 2`."
+    "matters: `stiffness_range=(0.5, 2)`, `jimpact advise --stiffness-range 0.5 2`."
 )
 # parameters of a law as it is printed
 _POSITIONAL = ("restitution", "stiffness", "exponent")
@@ -199,8 +198,7 @@ class Advice(Tabular):
         ]
         footnote = (
             f"Error of v+ against {self.reference}: sqrt(dv^T M dv) over sqrt(v-^T M "
-            f"v-), dv the "
-            f"difference of v+; stiffnesses tried: {self.rows}."
+            f"v-), dv the difference of v+; stiffnesses tried: {self.rows}."
         )
         notes = ["", *textwrap.wrap(footnote, _WIDTH)]
         if not self.unknown and any(
@@ -349,9 +347,8 @@ def _cause(advice: Advice) -> str:
     if advice.name == advice.reference and not advice.unknown:
         return (
             f"{stiffnesses}, taken as known: {advice.name} is the reference itself, "
-            f"and compliant, "
-            f"with springs in the place of its energies, is {share(advice.reclosing)} "
-            f"apart"
+            f"and compliant, with springs in the place of its energies, is "
+            f"{share(advice.reclosing)} apart"
         )
     return (
         f"{stiffnesses}: {advice.name} is within "

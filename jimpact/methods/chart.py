@@ -175,11 +175,9 @@ class WorkPrecision(Tabular):
         notes = [
             f"Reference: {self.reference.how}; uncertain by {uncertain}.",
             f"Errors: relative, the largest of {self.sample} impacts with stiffness "
-            f"spread over a "
-            f"factor {self.spread:g}; of a law its model error.",
+            f"spread over a factor {self.spread:g}; of a law its model error.",
             f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch "
-            f"of "
-            f"{self.batch} (from, to: "
+            f"of {self.batch} (from, to: "
             f"quartiles){', with J: with the Jacobian' * differentiated}.",
         ]
         notes += left_out_notes(self.left_out)
@@ -362,8 +360,7 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     if v.dtype != jnp.float64:
         raise ValueError(
             f"Argument `velocity` must be in double precision, but has dtype "
-            f"{v.dtype}: "
-            "enable jax_enable_x64."
+            f"{v.dtype}: enable jax_enable_x64."
         )
     check_law(law, scene, v.dtype)
     if not bool(law.contact(scene, v).happens):

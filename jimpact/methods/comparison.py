@@ -206,8 +206,7 @@ def compare(
     elif values:
         raise ValueError(
             f"Argument `laws` must be None where parameters are given, but "
-            f"{', '.join(values)} "
-            "came with it."
+            f"{', '.join(values)} came with it."
         )
     check_kind("laws", laws, Mapping)
     # the first calls, with compiling, sort out the laws that raise; then all are timed

@@ -146,8 +146,7 @@ class EnergyNorm(NamedTuple):
         if not whole or index.min() < 0 or index.max() >= count:
             raise ValueError(
                 f"Argument `watched` must be indices of coordinates from 0 to "
-                f"{count - 1}, but has "
-                f"value {watched!r}."
+                f"{count - 1}, but has value {watched!r}."
             )
         mass = dense_mass(scene)
         before = float(np.sqrt(velocity @ mass @ velocity)) or 1.0

@@ -213,20 +213,17 @@ class StabilityMap(Tabular):
         others = ""
         if checked.confirmed < checked.tried:
             others = (
-                f"; v+ of the others differs by up to {checked.difference:.1g} "
-                f"of "
+                f"; v+ of the others differs by up to {checked.difference:.1g} of "
                 f"|v-|: scipy "
             )
             others += "may end an impact too early (docs/stability.md)"
         head = [
             f"base: {base}; at most {self.max_steps:,} steps",
             f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of "
-            f"{checked.tried} "
-            f"solved by scipy, too, {checked.confirmed} agree to "
+            f"{checked.tried} solved by scipy, too, {checked.confirmed} agree to "
             f"{checked.within:g}{others}",
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for "
-            f"fixed steps, "
-            "of the largest |v-|",
+            f"fixed steps, of the largest |v-|",
             "",
         ]
         counts = [Column(name, lambda count: str(count or "")) for name in CLASSES]

@@ -209,9 +209,8 @@ class MonteCarlo(Tabular):
                 )
             ]
         text = (
-            f"integrated to rtol = {self.rtol:g}: its error in means and "
-            f"deviations "
-            f"is at most"
+            f"integrated to rtol = {self.rtol:g}: its error in means and deviations is "
+            f"at most"
         )
         return [f"{text} {self.rtol_error:.1g} standard errors"]
 

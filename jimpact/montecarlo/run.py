@@ -116,9 +116,8 @@ def monte_carlo(
     check_executor(executor)
     if workers is not None and executor != "threads":
         raise ValueError(
-            "Argument `workers` must be left out but for executor='threads', but has "
-            "value "
-            f"{workers!r} for {executor!r}."
+            f"Argument `workers` must be left out but for executor='threads', but has "
+            f"value {workers!r} for {executor!r}."
         )
     workers = as_workers(workers)
     if keep_samples and folder is None:
@@ -136,8 +135,7 @@ def monte_carlo(
         text = ", ".join(f"{count} {name}" for name, count in result.statuses.items())
         warnings.warn(
             f"{failed} of {result.samples} samples failed and are left out of the "
-            f"statistics "
-            f"({text}); see `bad` and `replay`.",
+            f"statistics ({text}); see `bad` and `replay`.",
             stacklevel=2,
         )
     if result.rtol_error > SHARE:

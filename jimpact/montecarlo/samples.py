@@ -348,8 +348,7 @@ def planned_run(
         if len(values) < samples:
             raise ValueError(
                 f"Argument `samples` must be at most {len(values)}, the rows of "
-                f"`{name}`, but has "
-                f"value {samples}."
+                f"`{name}`, but has value {samples}."
             )
     data, kind = _key(key)
     return Run(
@@ -386,8 +385,7 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     if gaps is None and not any(checked.random.values()):
         raise ValueError(
             "Argument `gaps` must be given where neither the velocity nor the law is "
-            "random: all "
-            "samples would be the same."
+            "random: all samples would be the same."
         )
     # a function of a key is called once, to look at its law
     if isinstance(law, Law):
@@ -403,8 +401,7 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     if gaps is not None and not drawn.uses_gaps:
         raise ValueError(
             f"Argument `gaps` must be None for {type(drawn).__name__}, which leaves "
-            f"open contacts "
-            "out: laws that use gaps are Compliant and Binary."
+            f"open contacts out: laws that use gaps are Compliant and Binary."
         )
     return in_common_dtype(checked, scene, drawn)[0]
 

@@ -140,8 +140,7 @@ class Store:
         if not manifest.exists():
             raise ValueError(
                 f"Folder '{folder}' has chunks but no {MANIFEST}, so the run that they "
-                f"belong "
-                "to is unknown: give another folder, or delete them."
+                f"belong to is unknown: give another folder, or delete them."
             )
         other = _identity(self.folder)
         names = sorted(identity.keys() | other.keys())
@@ -149,15 +148,14 @@ class Store:
         if FORMAT.items() - other.items():
             raise ValueError(
                 f"Folder '{folder}' holds a run that an earlier build of jimpact "
-                f"began, which this "
-                "one cannot continue: give another folder (`read_samples` reads raw "
-                "samples)."
+                f"began, which this one cannot continue: give another folder "
+                f"(`read_samples` reads raw samples)."
             )
         if differ:
             raise ValueError(
                 f"Folder '{folder}' holds another run, which differs in "
-                f"{', '.join(differ)}: "
-                "give another folder (or repeat that run's arguments to continue it)."
+                f"{', '.join(differ)}: give another folder (or repeat that run's "
+                f"arguments to continue it)."
             )
 
     def path(self, number: int) -> Path:
@@ -294,8 +292,7 @@ def _write(path: Path, content: bytes) -> None:
         raise OSError(
             error.errno,
             f"'{path}' could not be written, {what}; what was there before is intact, "
-            f"and the same "
-            "call continues from it",
+            f"and the same call continues from it",
         ) from error
     except BaseException:  # ctrl-C
         temporary.unlink(missing_ok=True)

@@ -62,9 +62,8 @@ DIRECTIONS = 64
 ADJOINTS = ("jacobian", "forward", "checkpoints")
 REVERSE_ONLY = (
     "Argument `adjoint` must be 'jacobian' or 'forward' for derivatives in forward "
-    "mode (jvp, "
-    "jacfwd, hessian), but has value 'checkpoints', which has the reverse mode only "
-    "(grad, vjp)."
+    "mode (jvp, jacfwd, hessian), but has value 'checkpoints', which has the reverse "
+    "mode only (grad, vjp)."
 )
 
 

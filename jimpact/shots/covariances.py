@@ -49,8 +49,7 @@ def as_covariance(
     if array.shape not in (of_each, of_all):
         raise ValueError(
             f"Argument `covariance` must have shape {of_each}, (v-, v+) of each shot, "
-            f"or {of_all}, "
-            f"of all shots, but has shape {array.shape}."
+            f"or {of_all}, of all shots, but has shape {array.shape}."
         )
     check_values("covariance", array)
     blocks = diagonal_blocks(array, 2 * n)
@@ -183,8 +182,7 @@ def whitening(
     except np.linalg.LinAlgError:
         raise ValueError(
             "Argument `covariance` must leave an error in each velocity after an "
-            "impact that the "
-            "law predicts from those before, but is singular there: are shots in it "
-            "twice?"
+            "impact that the law predicts from those before, but is singular there: "
+            "are shots in it twice?"
         ) from None
     return errors.reshape(used.shape), np.linalg.inv(factor).reshape(covariance.shape)

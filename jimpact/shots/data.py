@@ -140,8 +140,7 @@ class Experiments(eqx.Module):
         if self.sigma_pre is not None and self.sigma is None:
             raise ValueError(
                 "Argument `sigma` must be given where `sigma_pre` is, but is None: the "
-                "errors "
-                "before and after the impact weigh against each other."
+                "errors before and after the impact weigh against each other."
             )
         if scenes is None:
             self.scenes = None
@@ -166,9 +165,8 @@ class Experiments(eqx.Module):
         if len(self.units) != n or not set(self.units) <= {LINEAR, ANGULAR}:
             raise ValueError(
                 f"Argument `units` must have {n} entries, each '{LINEAR}' or "
-                f"'{ANGULAR}', "
-                f"but has value {units!r}: convert velocities to these (1 cm/s = 0.01 "
-                f"m/s)."
+                f"'{ANGULAR}', but has value {units!r}: convert velocities to these (1 "
+                f"cm/s = 0.01 m/s)."
             )
 
     def __str__(self) -> str:
@@ -496,9 +494,8 @@ class Experiments(eqx.Module):
             )
         if scene.size != self.pre.shape[1]:
             raise ValueError(
-                "Argument `experiments` must have one velocity per body of the scene: "
-                "it has "
-                f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
+                f"Argument `experiments` must have one velocity per body of the scene: "
+                f"it has {self.pre.shape[1]} a shot, but the scene has {scene.size}."
             )
         return [function(scene)] * len(self.shots)
 
@@ -577,8 +574,7 @@ def _check_alone(given: str, others: dict[str, Any]) -> None:
         if beside is not None:
             raise ValueError(
                 f"Argument `{name}` must be left out where `{given}` is given, which "
-                f"holds all "
-                "errors, but both are given."
+                f"holds all errors, but both are given."
             )
 
 
@@ -611,8 +607,7 @@ def _as_sigma(
     if sigma.shape not in ((), measured.shape):
         raise ValueError(
             f"Argument `{name}` must be a scalar or have shape {measured.shape} like "
-            f"`post`, "
-            f"but has shape {tuple(sigma.shape)}."
+            f"`post`, but has shape {tuple(sigma.shape)}."
         )
     # the error of a value that was not measured does not matter
     check_values(
@@ -634,8 +629,7 @@ def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, 
         if scene.size != shape[1]:
             raise ValueError(
                 f"Argument `scenes` must have {shape[1]} bodies as the velocities "
-                f"have, "
-                f"but the scene of shot {k + 1} has {scene.size}."
+                f"have, but the scene of shot {k + 1} has {scene.size}."
             )
     stackable(scenes)  # raises where they cannot be fitted together
     return scenes
@@ -719,8 +713,7 @@ def _scenes_of(
     if not isinstance(place, Scene) or ("mass" in values and place.walls is None):
         raise ValueError(
             f"{path}: columns `{columns[0]}` must belong to a chain that is given as "
-            f"`scene`, but "
-            f"that is {type(place).__name__}."
+            f"`scene`, but that is {type(place).__name__}."
         )
     count = len(values["pre"])
     gaps = values.get("gap", [place.gaps] * count)

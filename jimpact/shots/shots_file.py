@@ -45,9 +45,8 @@ _HEADER = re.compile(r"(t|[a-z_]+(?=_))(?:_([1-9][0-9]*))?\s*(?:\[([^]]*)\])?")
 _COMMENT = re.compile(r"comment(_.*)?")  # a column that is not read
 _ALLOWED = (
     "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, "
-    "3, ... "
-    "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`; `comment` is not "
-    "read)"
+    "3, ... (further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`; `comment` "
+    "is not read)"
 )
 _HOW = "columns are separated by commas, numbers have a decimal point"
 _ALLOWED_OF_MOTIONS = (
@@ -106,8 +105,8 @@ def read_positions(path: str | Path) -> Positions:
     if sorted(keys) != sorted(required):
         raise ValueError(
             f"{where}: the columns must be "
-            f"{', '.join(f'`{k}_{i}`' for k, i in required[1:])} and "
-            f"`t`, each once, but are {', '.join(c.header for c in columns)}."
+            f"{', '.join(f'`{k}_{i}`' for k, i in required[1:])} and `t`, each once, "
+            f"but are {', '.join(c.header for c in columns)}."
         )
     values = _values(columns, rows, dict.fromkeys(("t", *kinds), size))
     time = values["t"][:, 0]
@@ -149,10 +148,8 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
         k = int(off.argmax())
         raise ValueError(
             f"{where}: the times `t` must rise in equal steps, but sample {k + 1} at "
-            f"{time[k]:g} s "
-            f"is {off[k]:.2g} s off steps of {step:.6g} s; as they are written they "
-            f"may be "
-            f"{allowed:.2g} s off."
+            f"{time[k]:g} s is {off[k]:.2g} s off steps of {step:.6g} s; as they are "
+            f"written they may be {allowed:.2g} s off."
         )
     slope, start = np.polyfit(np.arange(len(time)), time, 1)
     return np.asarray(start + slope * np.arange(len(time)))
@@ -248,8 +245,7 @@ def _column(
             advice = "the first line names columns, bodies count from 1"
         raise ValueError(
             f"{where}: column {index + 1} must be one of {allowed}, but has name "
-            f"{header!r} "
-            f"({advice})."
+            f"{header!r} ({advice})."
         )
     units = kinds[kind]
     if body is None:
@@ -264,8 +260,7 @@ def _column(
     if unit.strip() not in units:
         raise ValueError(
             f"{where}: the unit of column `{header}` must be one of "
-            f"{', '.join(units)}, "
-            f"but is {unit!r}."
+            f"{', '.join(units)}, but is {unit!r}."
         )
     if unit.strip() in ("rad/s", "deg/s"):
         base = ANGULAR
@@ -289,8 +284,7 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
         if column in velocities and len(others) > 1:
             raise ValueError(
                 f"{where}: all columns of velocity {column.body} must be in m/s or all "
-                f"in rad/s, "
-                "but some are in each."
+                f"in rad/s, but some are in each."
             )
     kinds = [
         kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)
@@ -345,8 +339,7 @@ def _values(
     if not_numbers:
         warnings.warn(
             f"{not_numbers[0]}: the cell is NaN and counts as not measured, as an "
-            f"empty one does; "
-            f"{len(not_numbers)} cells of the file are.",
+            f"empty one does; {len(not_numbers)} cells of the file are.",
             stacklevel=1,  # one place for all callers: Python reports it once
         )
     return values
@@ -397,6 +390,5 @@ def _check_error(where: str, column: CsvColumn, measured: bool, error: float) ->
             value = f"is {error / column.factor:g}"
         raise ValueError(
             f"{where}, column `{column.header}`: the error of a measured value must be "
-            f"> 0, "
-            f"but {value}."
+            f"> 0, but {value}."
         )

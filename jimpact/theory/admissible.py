@@ -221,9 +221,8 @@ class AdmissibleSet:
         """Raise a ValueError unless the set is two-dimensional."""
         if self.dimension != 2:
             raise ValueError(
-                "An arc and a boundary need a set of dimension 2 (two independent "
-                "contacts), but "
-                f"this one has dimension {self.dimension}."
+                f"An arc and a boundary need a set of dimension 2 (two independent "
+                f"contacts), but this one has dimension {self.dimension}."
             )
 
 
@@ -316,8 +315,7 @@ def _constraint_projector(
     basis = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]
     if np.linalg.norm(basis.T @ y) > tolerance * np.linalg.norm(y):
         raise ValueError(
-            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
-            "0, but is "
-            f"{np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
+            f"Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
+            f"0, but is {np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
         )
     return np.eye(len(y)) - basis @ basis.T

@@ -299,8 +299,7 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
     if comb(m, rank - 1) > _MOST_FACETS:
         raise ValueError(
             f"Argument `scene` must have fewer redundant contacts: {m} contacts of "
-            f"rank {rank} "
-            f"have more than {_MOST_FACETS} candidate facets."
+            f"rank {rank} have more than {_MOST_FACETS} candidate facets."
         )
     unit = generators / np.linalg.norm(generators, axis=0)
     if rank == 1:  # hulls begin with two dimensions

@@ -275,8 +275,7 @@ def friction_bounds(
     if np.linalg.cond(g_mu) > 1 / (len(g) * np.finfo(scene.mass.dtype).eps):
         raise ValueError(
             f"Argument `friction` must leave G^mu regular, but {np.asarray(friction)} "
-            f"makes it "
-            "singular."
+            f"makes it singular."
         )
     inverse = np.linalg.inv(g)
     m_bar = (np.eye(len(e)) - e).T @ inverse @ one_plus

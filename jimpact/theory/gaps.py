@@ -186,14 +186,13 @@ class GapSensitivity:
         elif not self.jacobian.any():
             lines.append(
                 "The outcome does not change with small changes of the gaps, yet it "
-                "varies: it "
-                "jumps where the order of the collisions changes. Trust the samples."
+                "varies: it jumps where the order of the collisions changes. Trust the "
+                "samples."
             )
         else:
             lines.append(
                 "The linearization fails over this spread: the gaps reach across a "
-                "crossover or a "
-                "curved part. Trust the samples."
+                "crossover or a curved part. Trust the samples."
             )
         return lines
 

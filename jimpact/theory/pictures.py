@@ -77,8 +77,7 @@ def admissible_set(
         if v.shape != (result.scene.size,):
             raise ValueError(
                 f"Argument `outcomes` must have arrays of shape "
-                f"({result.scene.size},), but "
-                f"{name!r} has shape {v.shape}."
+                f"({result.scene.size},), but {name!r} has shape {v.shape}."
             )
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2

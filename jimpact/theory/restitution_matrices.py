@@ -145,8 +145,7 @@ def _checked_size(matrix: jax.Array) -> int:
     if shape[0] > LARGEST:
         raise ValueError(
             f"Argument `matrix` must have at most {LARGEST} rows, as all 2^m supports "
-            f"are "
-            f"enumerated, but has {shape[0]}."
+            f"are enumerated, but has {shape[0]}."
         )
     return int(shape[0])
 
@@ -403,10 +402,8 @@ def _check_independent(scene: Scene, g: np.ndarray) -> None:
     if eigenvalues[0] <= floor:
         raise ValueError(
             f"Argument `scene` must have independent contacts, but its {len(g)} closed "
-            f"contacts "
-            f"have rank {int((eigenvalues > floor).sum())}: G is singular, and a "
-            f"matrix law "
-            "cannot be consistent for every velocity."
+            f"contacts have rank {int((eigenvalues > floor).sum())}: G is singular, "
+            f"and a matrix law cannot be consistent for every velocity."
         )
 
 

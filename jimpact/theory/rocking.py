@@ -195,8 +195,7 @@ class RockingDispersion(eqx.Module):
         outcomes = self.outcomes()
         lines = [
             f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} "
-            f"degrees "
-            f"({len(theta)} shapes), {len(self.restitution)} e"
+            f"degrees ({len(theta)} shapes), {len(self.restitution)} e"
         ]
         for j, mu in enumerate(np.asarray(self.friction)):
             counts = np.bincount(outcomes[:, j].ravel(), minlength=len(OUTCOMES))

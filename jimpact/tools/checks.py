@@ -91,8 +91,7 @@ def _on_host(name: str, value: Any) -> np.ndarray:
     except ValueError:  # rows of different lengths
         raise ValueError(
             f"Argument `{name}` must be an array, whose rows are equally long, but has "
-            f"value "
-            f"{short_repr(value)}."
+            f"value {short_repr(value)}."
         ) from None
     if host.dtype.kind not in "fiubV":  # V: the short floats of JAX
         raise _not_numeric(name, value, host.dtype.kind)
@@ -337,10 +336,8 @@ def check_concrete(name: str, value: Any) -> None:
     if is_traced(value):
         raise TypeError(
             f"Argument `{name}` must hold numbers, but is traced: fits run on the "
-            f"host, not under "
-            "jit, vmap or grad. For these, `FitProblem.residual` and `jacobian` are "
-            "pure functions "
-            "of the parameters."
+            f"host, not under jit, vmap or grad. For these, `FitProblem.residual` and "
+            f"`jacobian` are pure functions of the parameters."
         )
 
 
@@ -367,8 +364,7 @@ def check_per_contact(name: str, value: Any, contacts: int) -> None:
     if np.shape(value) not in ((), (contacts,)):
         raise ValueError(
             f"Argument `{name}` must be a scalar or have shape ({contacts},), one "
-            f"value per "
-            f"contact, but has shape {tuple(np.shape(value))}."
+            f"value per contact, but has shape {tuple(np.shape(value))}."
         )
 
 
@@ -395,6 +391,6 @@ def check_executor(executor: Any) -> None:
     if not known:
         raise ValueError(
             f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address "
-            f"of a Dask "
-            f"scheduler, or an object with a method `map`, but is {executor!r}."
+            f"of a Dask scheduler, or an object with a method `map`, but is "
+            f"{executor!r}."
         )

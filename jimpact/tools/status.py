@@ -49,10 +49,8 @@ STATUS = (
     Status(
         "coarse_step",
         "steps are too long: within 3 a contact is struck again, at more than a tenth "
-        "of the "
-        "largest gap velocity, or in one bodies pass each other, or a disc of a pile "
-        "moves by more "
-        "than the least radius",
+        "of the largest gap velocity, or in one bodies pass each other, or a disc of a "
+        "pile moves by more than the least radius",
         False,
     ),
     Status(
@@ -72,8 +70,7 @@ STATUS = (
     Status(
         "no_contact_force",
         "contact forces with friction have no solution, and the law has no impact "
-        "without "
-        "collision for it: LZB with `friction` has one",
+        "without collision for it: LZB with `friction` has one",
         True,
     ),
     Status("room", "more contacts are closed than the body has `room` for", True),
@@ -81,8 +78,7 @@ STATUS = (
     Status(
         "max_steps",
         "the step limit, or steps that vanish, ended the impact or the motion before "
-        "it was over; "
-        "for an impact by LZB or Compliant try method='implicit'",
+        "it was over; for an impact by LZB or Compliant try method='implicit'",
         True,
     ),
     Status("penetration", "a gap is negative at the start", True),
@@ -94,8 +90,7 @@ STATUS = (
         "out_of_range",
         (
             "an argument, the energy of the impact or a gap function on the way is "
-            "outside "
-            "its range"
+            "outside its range"
         ),
         True,
     ),

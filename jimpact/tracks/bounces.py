@@ -48,24 +48,20 @@ def bounce_times(times: Any, sigma: Any, gravity: float = 9.80665) -> Experiment
     check_values("gravity", np.asarray(gravity, float), low=0.0, open_low=True)
     if times.ndim != 1 or len(times) < 3:
         raise ValueError(
-            "Argument `times` must be three or more in a row: a bounce needs one "
-            "before and one "
-            f"after, but has shape {times.shape}."
+            f"Argument `times` must be three or more in a row: a bounce needs one "
+            f"before and one after, but has shape {times.shape}."
         )
     if not (np.diff(times) > 0).all():
         k = int(np.argmin(np.diff(times) > 0))
         raise ValueError(
             f"Argument `times` must rise, but time {k + 2}, {times[k + 1]:g} s, is not "
-            f"after "
-            f"{times[k]:g} s (a bounce that was not heard is often written as 0: leave "
-            f"it out, and "
-            "what is on both sides is two parts)."
+            f"after {times[k]:g} s (a bounce that was not heard is often written as 0: "
+            f"leave it out, and what is on both sides is two parts)."
         )
     if sigma.shape not in ((), times.shape):
         raise ValueError(
             f"Argument `sigma` must be a number or have shape {times.shape}, but has "
-            f"shape "
-            f"{sigma.shape}."
+            f"shape {sigma.shape}."
         )
     count = len(times) - 2
     # of each flight: g T / 2

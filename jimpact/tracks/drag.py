@@ -92,10 +92,8 @@ def bent(
     if not moved <= 1e-6 * length:
         raise ValueError(
             f"Argument `drag` must be a coefficient [1/m], `acceleration` a function, "
-            f"that bends "
-            f"flights little, but drag {float(np.max(np.abs(k))):.3g} is too much for "
-            f"a flight "
-            f"of {float(h.max()):.3g} s at "
+            f"that bends flights little, but drag {float(np.max(np.abs(k))):.3g} is "
+            f"too much for a flight of {float(h.max()):.3g} s at "
             f"{float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
         )
     u = 2 * (x - tau[:, :1]) / h[:, 0] - 1

@@ -194,9 +194,8 @@ def _model(
         check_values("drag", np.asarray(drag, float), low=0.0)
     if (drag != 0 or force is not None) and "rad" in units:
         raise ValueError(
-            "Argument `drag` must be 0, and `acceleration` no function, where q holds "
-            "angles, as "
-            f"they are of places, but `drag` has value {drag}."
+            f"Argument `drag` must be 0, and `acceleration` no function, where q holds "
+            f"angles, as they are of places, but `drag` has value {drag}."
         )
     return Flight(known, unknown, drag or 0.0, drag is None, force)
 
@@ -294,8 +293,7 @@ def _checked(
     if t.ndim != 1 or q.ndim != 2 or len(t) != len(q) or q.shape[1] == 0:
         raise ValueError(
             f"Arguments `t` and `q` must have shapes (T,) and (T,) or (T, n), but have "
-            f"{t.shape} "
-            f"and {q.shape}."
+            f"{t.shape} and {q.shape}."
         )
     if (
         isinstance(shortest, bool)
@@ -310,8 +308,7 @@ def _checked(
     if len(t) < shortest:
         raise ValueError(
             f"Argument `t` must have {shortest} frames or more, those of a flight "
-            f"(`shortest`), "
-            f"but has {len(t)}."
+            f"(`shortest`), but has {len(t)}."
         )
     if not (np.diff(t) > 0).all():
         k = int(np.argmin(np.diff(t) > 0))
@@ -340,8 +337,7 @@ def _checked(
     if len(names) != n or not set(names) <= set(VELOCITY_OF):
         raise ValueError(
             f"Argument `units` must have {n} entries, each 'm' or 'rad', but has value "
-            f"{units!r}: "
-            "convert lengths and angles to these."
+            f"{units!r}: convert lengths and angles to these."
         )
     return t, q, tuple(names)
 
@@ -356,8 +352,7 @@ def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
     if array.shape not in ((), (n,)):
         raise ValueError(
             f"Argument `{name}` must be a number or have shape ({n},), one for each "
-            f"coordinate, "
-            f"but has shape {array.shape}."
+            f"coordinate, but has shape {array.shape}."
         )
     check_values(name, array)
     return np.broadcast_to(array, (n,)).copy()

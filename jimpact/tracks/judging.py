@@ -59,9 +59,8 @@ def findings_of_input(
         if DOUBLED <= same.mean() < 1:
             found.append(
                 f"{int(same.sum())} of {len(places)} frames repeat the one before to "
-                f"the last "
-                "digit: a film converted to another rate has frames twice, and its "
-                "times are wrong."
+                f"the last digit: a film converted to another rate has frames twice, "
+                f"and its times are wrong."
             )
     for c in np.flatnonzero(np.array(units) == "rad"):
         if len(places) > 1:
@@ -73,8 +72,7 @@ def findings_of_input(
         if (steps > 3 * np.pi).any() or np.quantile(turned, 0.9) > np.pi / 2:
             found.append(
                 f"Coordinate {c + 1} turns by more than a quarter of a turn from frame "
-                f"to frame: "
-                "is it in degrees, or do the frames miss turns?"
+                f"to frame: is it in degrees, or do the frames miss turns?"
             )
         elif sigma[c] > COARSE_ANGLE:
             found.append(
@@ -103,14 +101,13 @@ def findings_of_turns(
     if len(cosines) and np.quantile(2 * np.arccos(cosines), 0.9) > np.pi / 2:
         found.append(
             "The body turns by more than a quarter of a turn from frame to frame: do "
-            "the frames "
-            "miss turns?"
+            "the frames miss turns?"
         )
     if (sigma > COARSE_ANGLE).any():
         found.append(
             f"The orientations have a standard error of {sigma.max():.2g} rad: is "
-            f"`sigma` in "
-            "degrees, or does the body not turn freely between impacts (`inertia`)?"
+            f"`sigma` in degrees, or does the body not turn freely between impacts "
+            f"(`inertia`)?"
         )
     freedom = max(np.isfinite(residual).sum() - taken, 1.0)
     square = float(np.nansum(residual**2))
@@ -118,16 +115,15 @@ def findings_of_turns(
         found.append(
             f"The body does not turn freely within sigma: residuals are "
             f"{np.sqrt(square / freedom):.2g} times as large. Perhaps `inertia` is "
-            f"another, an "
-            "impact was not found, or the orientations were smoothed."
+            f"another, an impact was not found, or the orientations were smoothed."
         )
     apart = np.flatnonzero(p_values < FALSE_ALARMS / 4 / max(len(p_values), 1))
     if apart.size:
         numbers = ", ".join(str(k + 1) for k in apart)
         found.append(
             f"The turns before and after impact {numbers} do not meet at the instant "
-            f"of the places:"
-            " are there two impacts in one, or were orientations smoothed across it?"
+            f"of the places: are there two impacts in one, or were orientations "
+            f"smoothed across it?"
         )
     return found
 
@@ -235,8 +231,7 @@ def _of_a_given_sigma(given: np.ndarray, found: np.ndarray) -> list[str]:
     return [
         f"Coordinate {c + 1} is not ballistic within sigma: its residuals are "
         f"{found[c] / given[c]:.2g} times as large, and the errors follow them. "
-        f"Perhaps times "
-        "jitter, frames are there twice, or a false point was tracked."
+        f"Perhaps times jitter, frames are there twice, or a false point was tracked."
         for c in np.flatnonzero(found > given)
     ]
 
@@ -251,14 +246,12 @@ def notes_of(search: Search, joined: int) -> list[str]:
     if within:
         found.append(
             f"{counted(within, 'candidate')} for an impact went: flights make such "
-            f"jumps without "
-            "one, by the size and the waves of their residuals"
+            f"jumps without one, by the size and the waves of their residuals"
         )
     if verdict.bends:
         found.append(
             f"{counted(verdict.bends, 'candidate')} for an impact went: a flight of "
-            f"another "
-            "acceleration explains the frames better"
+            f"another acceleration explains the frames better"
         )
     return found
 
@@ -270,10 +263,8 @@ def findings_of_doubts(doubts: np.ndarray) -> list[str]:
     numbers = listed([str(k + 1) for k in np.flatnonzero(doubts)])
     return [
         f"Impact {numbers} may be none: a flight of another acceleration explains its "
-        f"frames as "
-        "well. Perhaps drag, a rolling shutter, or the acceleration is wrong. "
-        "`experiments` leaves "
-        "it out unless `doubtful=True`."
+        f"frames as well. Perhaps drag, a rolling shutter, or the acceleration is "
+        f"wrong. `experiments` leaves it out unless `doubtful=True`."
     ]
 
 
@@ -287,8 +278,8 @@ def findings_of_held(
     """
     why = (
         "there are no flights of this acceleration. Perhaps the body rests, slides, "
-        "rolls or is "
-        "held, it bounces faster than frames show, or the acceleration is wrong."
+        "rolls or is held, it bounces faster than frames show, or the acceleration is "
+        "wrong."
     )
     found = []
     start = flights[0][0]
@@ -337,9 +328,8 @@ def _of_curvatures(t: np.ndarray, arcs: Arcs) -> list[str]:
             taken = ""
         found.append(
             f"Flight {i + 1} is not ballistic: coordinate {c + 1} has an acceleration "
-            f"of "
-            f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps "
-            f"{why}.{taken}"
+            f"of {excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. "
+            f"Perhaps {why}.{taken}"
         )
     return found
 
@@ -350,9 +340,8 @@ def _of_waves(arcs: Arcs) -> list[str]:
     return [
         f"Flights wave in coordinate {c + 1}, by {errors.waves[c]:.2g} over "
         f"{errors.times[c]:.2g} s beside noise of {errors.sigma[c]:.2g}: perhaps a "
-        f"table that is "
-        "not level, a lens, drag, spin, a moving camera or times that err. The errors "
-        "hold this."
+        f"table that is not level, a lens, drag, spin, a moving camera or times that "
+        f"err. The errors hold this."
         for c in np.flatnonzero(errors.waves)
     ]
 
@@ -379,8 +368,7 @@ def _of_sizes(arcs: Arcs) -> list[str]:
                 f"Flight {i + 1} is not ballistic within sigma: its residuals are "
                 f"{np.sqrt(np.nansum(rest**2) / freedom):.2g} times as large (p-value "
                 f"{p_value:.1g}). Perhaps times jitter, frames are there twice, or a "
-                f"false point "
-                "was tracked."
+                f"false point was tracked."
             )
     return found + _of_times(arcs)
 
@@ -408,21 +396,18 @@ def _unused(frames: Frames, members: Sequence[np.ndarray], shortest: int) -> lis
         if count >= shortest:
             found.append(
                 f"The {where} {len(rows)} frames fit no flight: their acceleration is "
-                f"another, or "
-                "their errors are larger. An impact there is not found."
+                f"another, or their errors are larger. An impact there is not found."
             )
         elif count >= AT_AN_END:
             found.append(
                 f"The {where} {len(rows)} frames are too few for a flight, and fit no "
-                f"other: an "
-                "impact there is not found."
+                f"other: an impact there is not found."
             )
     inner = slice(order[0], order[-1] + 1)
     lost = int((seen[inner] & ~used[inner]).sum())
     if lost > UNUSED * seen[inner].sum() + 1:
         found.append(
             f"{lost} of {int(seen[inner].sum())} frames are left out: they fit no "
-            f"flight, or lie "
-            "in a contact."
+            f"flight, or lie in a contact."
         )
     return found

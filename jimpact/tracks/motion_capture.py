@@ -190,8 +190,7 @@ def _qualisys(path: Path, text: str) -> Capture:
     if included != "3D" or "MARKER_NAMES" not in head:
         raise ValueError(
             f"{path}: DATA_INCLUDED must be 3D, places of markers (MARKER_NAMES), but "
-            f"is "
-            f"{included}: export the 3D data."
+            f"is {included}: export the 3D data."
         )
     names = [name for name in head["MARKER_NAMES"] if name]
     _check_once(path, names)
@@ -282,8 +281,8 @@ def _times(
     if per_frame > 0 and apart > digit + RATE_WITHIN / rate:
         raise ValueError(
             f"{path}: the file states {rate:g} frames a second, but its times are "
-            f"{step:g} s "
-            f"apart, {1 / step:.6g} a second: which one is right? Correct the file."
+            f"{step:g} s apart, {1 / step:.6g} a second: which one is right? Correct "
+            f"the file."
         )
     running = (np.diff(frames) == 1).all()
     if running and digit * rate > DIGIT_WITHIN:
@@ -429,6 +428,6 @@ def check_not_zero(path: str | Path, name: str, places: np.ndarray) -> None:
         if count >= AT_AN_END:
             raise ValueError(
                 f"{path}: marker `{name}` is at exactly 0, 0, 0 in the {end} {count} "
-                f"frames, as "
-                "some programs write what was not seen: make these cells empty."
+                f"frames, as some programs write what was not seen: make these cells "
+                f"empty."
             )

@@ -38,9 +38,8 @@ def with_turns(
     for k, some in enumerate(frames, 1):
         if len(some) < 2:
             raise ValueError(
-                "Argument `q` must have an orientation in 2 frames or more of each "
-                "flight, but in "
-                f"flight {k} it has {len(some)}."
+                f"Argument `q` must have an orientation in 2 frames or more of each "
+                f"flight, but in flight {k} it has {len(some)}."
             )
     turns = [Rotation.from_quat(e[some], scalar_first=True) for some in frames]
     if sigma is None:

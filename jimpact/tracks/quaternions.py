@@ -21,9 +21,8 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
     q = np.array(q, float)
     if q.ndim != 2 or q.shape[1] != 7:
         raise ValueError(
-            "Argument `q` must have shape (T, 7), x, y, z and a quaternion, as "
-            "`quaternion` is "
-            f"given, but has shape {q.shape}."
+            f"Argument `q` must have shape (T, 7), x, y, z and a quaternion, as "
+            f"`quaternion` is given, but has shape {q.shape}."
         )
     e = q[:, 3:][:, np.roll(ORDERS[order], 1)]
     length = np.linalg.norm(e, axis=1)
@@ -32,8 +31,8 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
         k = int(far.argmax())
         raise ValueError(
             f"Argument `q` must have quaternions of length 1, but that of frame "
-            f"{k + 1} has length "
-            f"{length[k]:.4g}. Are these angles? A lost frame must be NaN, not 0."
+            f"{k + 1} has length {length[k]:.4g}. Are these angles? A lost frame must "
+            f"be NaN, not 0."
         )
     return q[:, :3], e / length[:, None]
 
@@ -58,9 +57,8 @@ def as_inertia(inertia: Any) -> np.ndarray | None:
         moments = np.zeros(3)
     if not moments[0] > 0:
         raise ValueError(
-            "Argument `inertia` must be three moments > 0 along the axes of the body, "
-            "or a "
-            f"symmetric (3, 3), but has value {np.asarray(inertia).tolist()}."
+            f"Argument `inertia` must be three moments > 0 along the axes of the body, "
+            f"or a symmetric (3, 3), but has value {np.asarray(inertia).tolist()}."
         )
     if np.allclose(moments, moments[0]):
         return None

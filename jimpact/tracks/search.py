@@ -198,11 +198,9 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
         frames = frames.with_sigma(LARGER * frames.sigma)
     if not flights:
         raise ValueError(
-            "Argument `q` must hold a flight, but no frames in a row lie on an arc "
-            "within sigma = "
-            f"{frames.sigma.tolist()} at an acceleration of "
-            f"{flight.acceleration.tolist()}: are "
-            "these the units of q?"
+            f"Argument `q` must hold a flight, but no frames in a row lie on an arc "
+            f"within sigma = {frames.sigma.tolist()} at an acceleration of "
+            f"{flight.acceleration.tolist()}: are these the units of q?"
         )
     free = free_flights(straight, flight.acceleration, flights)
     verdict = judged(straight, free, flight, settings.estimated)
@@ -340,8 +338,7 @@ def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
     if min(map(len, near)) < 3:
         raise ValueError(
             f"Argument `window` must leave 3 frames or more of each flight, but "
-            f"{window:g} s leave "
-            f"{min(map(len, near))}."
+            f"{window:g} s leave {min(map(len, near))}."
         )
     contact = search.settings.contact
     instants = arcs.instants[1:-1]

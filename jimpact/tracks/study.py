@@ -105,8 +105,7 @@ def shots_of_track(
         if len(track.units) != owner.size:
             raise ValueError(
                 f"`columns` in [track] must be those of {owner.size} coordinates, one "
-                f"of "
-                f"each body of the scene, but are {len(track.units)}."
+                f"of each body of the scene, but are {len(track.units)}."
             )
     if "near_m" in table:
         options = {"near": table["near_m"]}

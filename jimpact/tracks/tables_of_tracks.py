@@ -128,8 +128,7 @@ def read(
     if size > LARGEST:
         raise ValueError(
             f"{path}: a table must have {LARGEST / 1e9:g} GB at most, but has "
-            f"{size / 1e9:.3g}: "
-            "cut it into takes, or leave out columns."
+            f"{size / 1e9:.3g}: cut it into takes, or leave out columns."
         )
     capture = capture_of(Path(path))
     if capture is not None:
@@ -170,8 +169,7 @@ def _of_capture(
     ):
         raise ValueError(
             f"{path}: the file states {capture.rate:g} frames a second, but argument "
-            f"`rate` is "
-            f"{rate:g}."
+            f"`rate` is {rate:g}."
         )
     if capture.rate is not None:
         rate = capture.rate
@@ -228,8 +226,7 @@ def _unit_of_capture(
     if len(own) > 1 or own - set(UNITS):
         raise ValueError(
             f"Argument `unit` must be one unit of all lengths, one of "
-            f"{', '.join(UNITS)}, but has "
-            f"value {short_repr(unit)}."
+            f"{', '.join(UNITS)}, but has value {short_repr(unit)}."
         )
     stated = capture.unit or next(iter(own), "m")
     if own and own != {stated}:
@@ -377,9 +374,8 @@ def _times(
         return table.order / rate
     if (time is None) == (rate is None):
         raise ValueError(
-            "Either argument `time` (a column) or `rate` (frames a second) must be "
-            "given, but "
-            f"{'neither' if time is None else 'both'} are."
+            f"Either argument `time` (a column) or `rate` (frames a second) must be "
+            f"given, but {'neither' if time is None else 'both'} are."
         )
     if rate is None:
         assert table.order is not None
@@ -400,14 +396,13 @@ def _check_lines_are_frames(path: str | Path, name: str, frames: np.ndarray) -> 
         k = int(jumps.argmax())
         raise ValueError(
             f"{path}: column `{name}` goes from {frames[k]:g} to {frames[k + 1]:g}, "
-            f"but argument "
-            f"`rate` counts every line as a frame: give frame={name!r} beside it."
+            f"but argument `rate` counts every line as a frame: give frame={name!r} "
+            f"beside it."
         )
     if (steps == 0).any():
         warnings.warn(
             f"{path}: column `{name}` repeats frames, but argument `rate` counts every "
-            f"line as "
-            f"one: give frame={name!r}, and `where` to choose a body.",
+            f"line as one: give frame={name!r}, and `where` to choose a body.",
             UserWarning,
             stacklevel=4,
         )
@@ -424,8 +419,8 @@ def _check_times(path: str | Path, name: str, t: np.ndarray) -> None:
     if steady and not (np.diff(t) > 0).all():
         raise ValueError(
             f"{path}: column `{name}` holds steps between frames, about "
-            f"{np.median(t):.4g} s, not "
-            "times: write their sums into a column, or give `rate`."
+            f"{np.median(t):.4g} s, not times: write their sums into a column, or give "
+            f"`rate`."
         )
     _check_rising(path, f"column `{name}`", t)
 
@@ -466,10 +461,8 @@ def _units(unit: str | Sequence[str] | None, names: Sequence[Name]) -> list[str]
     if len(units) != len(names) or not all(each in UNITS for each in units):
         raise ValueError(
             f"Argument `unit` must be one of {', '.join(UNITS)}, or one for each of "
-            f"{len(names)} "
-            f"columns, but has value {short_repr(unit)}. Pixels are no lengths: "
-            f"multiply by metres "
-            "per pixel, and mind that y may point down."
+            f"{len(names)} columns, but has value {short_repr(unit)}. Pixels are no "
+            f"lengths: multiply by metres per pixel, and mind that y may point down."
         )
     return units
 
@@ -518,8 +511,7 @@ def _without_names(
                 return k, separator
     raise ValueError(
         f"{path}: no line has a number in column {wanted[0]} and {last + 1} columns "
-        f"(they are "
-        "counted from 0)."
+        f"(they are counted from 0)."
     )
 
 
@@ -546,8 +538,7 @@ def _header(
     named = [cell for cell in likely if cell]
     raise ValueError(
         f"{path}: no line holds the names {', '.join(f'`{name}`' for name in wanted)} "
-        f"of columns; "
-        f"`{missing}` is missing{suggestion(missing, named)} in "
+        f"of columns; `{missing}` is missing{suggestion(missing, named)} in "
         f"{', '.join(named) or 'the file'}."
     )
 
@@ -597,8 +588,7 @@ def _numbers(
         if other in cell or not _is_number(cell, decimal):
             raise ValueError(
                 f"{path}, line {line}, column `{name}`: {cell!r} must be a number with "
-                f"the decimal "
-                f"mark {decimal!r} (argument `decimal`)."
+                f"the decimal mark {decimal!r} (argument `decimal`)."
             )
         values.append(float(cell.replace(decimal, ".")))
     return values

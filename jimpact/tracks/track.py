@@ -207,8 +207,7 @@ class Track:
         if not kept.size:
             raise ValueError(
                 f"All of {counted(len(self.impacts), 'impact')} of the track are "
-                f"doubtful, see "
-                "`warnings`: there are no shots, but with doubtful=True."
+                f"doubtful, see `warnings`: there are no shots, but with doubtful=True."
             )
         if scene is not None:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
@@ -227,12 +226,10 @@ class Track:
             kept = np.flatnonzero(certain & possible & free)
             if not kept.size:
                 raise ValueError(
-                    "Argument `scene` must be that of an impact of the track, but of "
-                    "none of "
-                    f"{len(self.impacts)} a contact is closed within near = {near:g} "
-                    f"m, approaches "
-                    "and can have made the jump, between flights in which the body is "
-                    "free."
+                    f"Argument `scene` must be that of an impact of the track, but of "
+                    f"none of {len(self.impacts)} a contact is closed within near = "
+                    f"{near:g} m, approaches and can have made the jump, between "
+                    f"flights in which the body is free."
                 )
             scenes = [at[k] for k in kept]
             if isinstance(scene, Body):
@@ -285,9 +282,8 @@ class Track:
         if self.order is None:
             raise ValueError(
                 "Argument `scene` must not be a body in space, whose angular velocity "
-                "is no rate "
-                "of coordinates: give `find_impacts` poses, places and quaternions "
-                "(`quaternion`)."
+                "is no rate of coordinates: give `find_impacts` poses, places and "
+                "quaternions (`quaternion`)."
             )
         first = body.scenes([self.impacts[0].q], near)[0]
         own = dense_mass(first)[3:, 3:]
@@ -320,11 +316,10 @@ class Track:
         # a few close a gap by chance, as a cube looks the same from many sides
         if other > 2 * here + 1 or other > here == 0:
             raise ValueError(
-                "Argument `quaternion` of `find_impacts` must name the order of the "
-                "file, but in "
-                f"the order {self.order!r} {here} of {counted(len(turned), 'impact')} "
-                f"can be of "
-                f"this body, in the other one {other}."
+                f"Argument `quaternion` of `find_impacts` must name the order of the "
+                f"file, but in the order {self.order!r} {here} of "
+                f"{counted(len(turned), 'impact')} can be of this body, in the other "
+                f"one {other}."
             )
 
 
