@@ -12,6 +12,7 @@ from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.bodies.study import body_of
 from jimpact.cli.study_file import (
     NO_DATA,
+    WrongOption,
     check_tables,
     fit_arguments,
     law_of,
@@ -195,7 +196,8 @@ def motion_study(path: str | Path) -> MotionStudy:
 def _read(
     path: str | Path, table: str, build: Callable[[dict[str, Any], Path], AnyStudy]
 ) -> AnyStudy:
-    """Study that `build(tables, path)` makes of a TOML file; its errors name the file.
+    """Study that `build(tables, path)` makes of a TOML file; its errors name the file,
+    but those of an option.
 
     `table` is the head of a table that all bundled studies of this kind have: a missing
     file's error lists these.
@@ -203,6 +205,8 @@ def _read(
     file = located(Path(path), table)
     try:
         return build(read_tables(file), file)
+    except WrongOption:
+        raise
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from None
 

@@ -34,6 +34,10 @@ NO_DATA = (
 # and reading
 
 
+class WrongOption(ValueError):
+    """An option of the command line is wrong, not the study."""
+
+
 def located(path: Path, table: str) -> Path:
     """Path of a study: the file, `study.toml` in the folder, or the bundled study of
     this name.
@@ -159,8 +163,11 @@ def law_of(
         import_laws(str(table["module"]), folder)
     study_law = str(table["name"]).lower()
     name = (other_law or study_law).lower()
-    for word in (study_law, name):
-        check_word("the law", word, REGISTRY)
+    check_word("the law", study_law, REGISTRY)
+    try:
+        check_word("--law", name, REGISTRY)
+    except ValueError as error:
+        raise WrongOption(str(error)) from None
     others = ("name", "module", "bounds", "priors")
     check_keys("[law]", table, (*REGISTRY[study_law].arguments, *others))
     not_of_law = (*OF_A_SCENE, *OF_A_MOTION)

@@ -169,7 +169,7 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
             contacts.
 
     Raises:
-        ValueError: not one velocity, or name, per coordinate.
+        ValueError: not one velocity, or name, per coordinate; another scene.
 
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
@@ -183,6 +183,12 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         counts = zip(*np.unique(codes, return_counts=True))
         rows = [f"{STATUS[c].name:24s}{k:10d}" for c, k in counts]
         return "\n".join([f"{codes.size} impacts by status", *rows])
+    size = out.velocity.shape[-1]
+    if size != scene.size:
+        raise ValueError(
+            f"Argument `scene` must be that of the impact, of {size} coordinates, but "
+            f"has {scene.size}."
+        )
     if names:
         check_shape("names", np.empty(len(names)), (scene.size,), "one per velocity")
     row = STATUS[int(codes)]

@@ -625,9 +625,10 @@ def load_fit(path: str | Path) -> "Fit":
     path = Path(path)
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except ValueError:
         raise ValueError(
-            f"{path}: the file must be a saved fit (JSON), but {error}."
+            f"{path}: the file must be a saved fit or motion (`Fit.save`), but is no "
+            "JSON."
         ) from None
     if not isinstance(record, dict) or "format" not in record:
         raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")

@@ -327,9 +327,9 @@ class RestitutionMatrix(Kinematic):
             )
         if scene.tangents is None:
             raise ValueError(
-                "Argument `scene` must have tangents for a `matrix` with tangential "
-                "blocks: "
-                "normal impulses cannot change tangential quasi-velocities."
+                f"Argument `matrix` must have shape ({m}, {m}) for {m} contacts "
+                f"without tangents, but has shape {self.matrix.shape}: normal impulses "
+                "cannot change tangential quasi-velocities."
             )
         gaps = scene.gaps
         if gaps is not None and not is_traced(gaps) and np.any(np.asarray(gaps) > 0):

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jimpact.tools.checks import is_traced
+
 
 class Status(NamedTuple):
     """One row of the table; `failure` marks results that must not be used as they
@@ -119,6 +121,11 @@ def raise_for(
         more: text to add for a row of the table, and the places (k,) of its code in
             flat `codes`.
     """
+    if is_traced(codes):
+        raise TypeError(
+            "Argument `out` must hold numbers, but is traced (jit, vmap, grad), where "
+            "nothing can be raised: read `out.status` (0: ok), or call this outside."
+        )
     codes = np.atleast_1d(np.asarray(codes))
     lines = []
     for code in np.unique(codes):

@@ -17,6 +17,9 @@ from jimpact.tracks.waves import Errors
 # Times that frames are divided, each time by errors and a model that the last one gave.
 # Three are common; where they do not agree after so many, the last ones are taken.
 ROUNDS = 8
+# Share by which the acceleration of frames may differ from the given one, or 100 or
+# 1 000 times it, where a wrong sign or unit is named. Ten times more: any number is.
+SAME_SIZE = 0.2
 # Share by which sigma may differ from that which divided the frames. Ten times more
 # would leave impacts of a wrong sigma; ten times less divides most tracks once more.
 AGREEING = 0.1
@@ -38,7 +41,9 @@ BEST_WINDOWS = 0.25
 # Residuals of arcs that meet, in errors of the flights alone, from which on one flight
 # is none. Ten times more would pass arcs that miss one another.
 UNMET = 2.0
-MOST_STRIDES = 32  # parts of the track that windows of the first acceleration are
+# Windows by which a first acceleration is found begin at so many places of a track, or
+# fewer. Ten times more: as long as a search takes; a third: they may miss the flights.
+MOST_STRIDES = 32
 
 
 @dataclass(frozen=True)
@@ -199,8 +204,9 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
     if not flights:
         raise ValueError(
             f"Argument `q` must hold a flight, but no frames in a row lie on an arc "
-            f"within sigma = {frames.sigma.tolist()} at an acceleration of "
-            f"{flight.acceleration.tolist()}: are these the units of q?"
+            f"within sigma = {[float(f'{x:.2g}') for x in frames.sigma]} at an "
+            f"acceleration of {flight.acceleration.tolist()}: "
+            f"{_likely_cause(frames, flight)}"
         )
     free = free_flights(straight, flight.acceleration, flights)
     verdict = judged(straight, free, flight, settings.estimated)
@@ -208,6 +214,30 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
         [np.ptp(frames.t[f]) > settings.contact for f in verdict.flights]
     )
     return Search(frames, flight, settings, flights, verdict)
+
+
+def _likely_cause(frames: Frames, flight: Flight) -> str:
+    """Question about t, the sign or the unit: by the second differences of q over dt^2.
+
+    Their median is that of the frames of flights, along the axis of the largest given
+    acceleration. Its opposite: the sign; 100 or 1 000 times it: the unit. Steps dt of a
+    whole number of seconds, one or more: t may count frames.
+    """
+    step = frames.step
+    axis = int(np.argmax(np.abs(flight.acceleration)))
+    given = float(flight.acceleration[axis])
+    seen = float(np.nanmedian(np.diff(frames.q[:, axis], 2)) / step**2)
+    if step >= 1 and step == round(step):
+        return f"are the steps of t, {step:g} s, numbers of frames?"
+    if given == 0:
+        return "are these the units of q and t?"
+    ratio = seen / given
+    if abs(ratio + 1) < SAME_SIZE:
+        return f"frames show {seen:.3g}: is the sign of the acceleration right?"
+    for unit, size in (("cm", 100.0), ("mm", 1000.0)):
+        if abs(abs(ratio) / size - 1) < SAME_SIZE:
+            return f"frames show {seen:.3g}: is q in {unit}?"
+    return f"frames show {seen:.3g} (median): are these the units of q and t?"
 
 
 def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:

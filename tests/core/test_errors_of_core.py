@@ -154,7 +154,7 @@ REFUSED = [
     ),
     (
         lambda: ji.impact(ji.RestitutionMatrix(jnp.eye(3)), BALLS, V),
-        r"must have tangents",
+        r"shape \(2, 2\) for 2 contacts without tangents",
     ),
     (lambda: ji.RandomLaw(ji.Binary(0.9)), "`parameters` must name one that is random"),
     (lambda: ji.impact(ji.LZB, BALLS, V), r"That is the class; LZB\(\.\.\.\) makes"),

@@ -344,7 +344,7 @@ def test_bad_matrix(matrix, message):
 def test_matrix_that_does_not_fit_the_scene():
     with pytest.raises(ValueError, match=r"shape \(2, 2\) or \(3, 3\) for 2 contacts"):
         ji.impact(RestitutionMatrix(jnp.eye(4)), CHAIN, [1.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="must have tangents"):
+    with pytest.raises(ValueError, match="without tangents"):
         ji.impact(RestitutionMatrix(jnp.eye(3)), CHAIN, [1.0, 0.0, 0.0])
     flat = block()
     gapped = ji.Scene(flat.mass, flat.normals, flat.tangents, gaps=[0.0, 1e-3])

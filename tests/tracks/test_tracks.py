@@ -118,6 +118,25 @@ def test_signs_units_and_gravity_that_are_wrong_are_told():
     assert good.warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("t", "q", "acceleration", "words"),
+    [
+        (1.0, 1.0, 9.51, "sign"),
+        (1.0, 1000.0, -9.5, "mm"),
+        (1.0, 100.0, -9.5, "cm"),
+        (60.0, 1.0, -9.5, "numbers of frames"),
+        (1.0, 1.0, -1.6, "units of q"),
+    ],
+)
+def test_a_track_without_a_flight_says_which_argument_explains_it(
+    t, q, acceleration, words
+):
+    seconds = np.arange(60) / 60
+    height = np.abs(2 - 4.75 * seconds**2)[:, None]
+    with pytest.raises(ValueError, match=words):
+        ji.tracks.find_impacts(t * seconds, q * height, acceleration=[acceleration])
+
+
 def test_known_values_are_kept_to_the_last_digit():
     t, y, _ = ball(np.random.default_rng(1))
     track = ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G)
