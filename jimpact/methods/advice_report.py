@@ -17,6 +17,7 @@ from jimpact.tools.records import (
     as_data,
     fields_as_data,
     listed,
+    one_digit,
 )
 from jimpact.tools.status import CODE, STATUS
 
@@ -178,6 +179,8 @@ class Advice(Tabular):
         else:
             verdict = "NOT within"
         head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
+        if not self.unknown and any(len(b.contacts) > 1 for b in self.blocks):
+            head[0] += ", if the stiffness ratios are these"
         for line in (self.reason, *_block_lines(self)):
             head += textwrap.wrap(line, _WIDTH)
         if self.unknown:
@@ -185,7 +188,7 @@ class Advice(Tabular):
         columns = (
             Column("law", lambda name: ("*" if name == self.name else " ") + name),
             *(Column(name, share) for name in ("median", "worst")),
-            Column("cost", ".3g", "relative cost"),
+            Column("cost", one_digit, "relative cost"),
             *(
                 Column(f"v_{i + 1}_plus", ".4f", f"v{i + 1}+")
                 for i in range(len(self.velocity))

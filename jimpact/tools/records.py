@@ -72,14 +72,26 @@ def number(value: float | None, form: str) -> str:
     return format(value, form)
 
 
+def one_digit(x: float | None) -> str:
+    """A number that another run may change by a few times, as text; '' for None.
+
+    >>> from jimpact.tools.records import one_digit
+    >>> one_digit(27.7), one_digit(1.41), one_digit(None)
+    ('30', '1', '')
+    """
+    if x is None:
+        return ""
+    return number(float(f"{x:.1g}"), "g")
+
+
 def microseconds(time: float | None) -> str:
-    """A time [s] in microseconds as text, '' for None.
+    """A time [s] in microseconds as text, '' for None: one digit, as it was measured.
 
     >>> from jimpact.tools.records import microseconds
     >>> microseconds(1.234e-5)
-    '12.3'
+    '10'
     """
-    return number(None if time is None else 1e6 * time, ".3g")
+    return one_digit(None if time is None else 1e6 * time)
 
 
 def listed(labels: Sequence[str], most: int = 6) -> str:
