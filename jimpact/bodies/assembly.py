@@ -27,6 +27,7 @@ from jimpact.bodies.rigid import (
     RigidBodies,
     RigidBody,
     Shape,
+    quaternion_of,
     times,
     unit_quaternion,
 )
@@ -206,7 +207,7 @@ class Bodies(RigidBodies):
         check_values("places", self.places)
         if self.dimension == 3:
             for place in self.places:
-                unit_quaternion(place[3:])
+                unit_quaternion(quaternion_of(place))
         self.pairs = _as_pairs(every, self.shapes, len(bodies), d, pairs)
         if not len(self.pairs_in_contact()):
             raise ValueError(
@@ -241,8 +242,8 @@ class Bodies(RigidBodies):
         is_round = round_bodies[each]
         one_round = is_round.sum(axis=1) == 1
         mixed = each[one_round]
-        first_round = is_round[one_round, :1]
-        mixed = np.where(first_round, mixed, mixed[:, ::-1])
+        first_is_round, _ = is_round[one_round].T
+        mixed = np.where(first_is_round[:, None], mixed, mixed[:, ::-1])
         return each[is_round.all(axis=1)], mixed, each[~is_round.any(axis=1)]
 
     def pairs_in_contact(self) -> np.ndarray:
@@ -278,7 +279,9 @@ class Bodies(RigidBodies):
             b = points[j]
             facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # indices of sides
             counts = self._counts
-            angles = self.all_bodies(q)[:, 2]
+            angles = self.all_bodies(q)[
+                :, -1
+            ]  # q = (x, y, theta) of discs and polygons
             at = (angles[i], angles[j])
             sizes = (counts[i], counts[j])
             # which of the two contacts of a pair comes first, so that one keeps its
@@ -337,15 +340,18 @@ class Bodies(RigidBodies):
         points = placed.points
         discs, mixed, faces = self._kinds
         if len(discs):
-            margins.append(lengths(points[discs[:, 0], 0] - points[discs[:, 1], 0])[0])
+            i, j = discs.T
+            distance, _ = lengths(points[i, 0] - points[j, 0])
+            margins.append(distance)
         if len(mixed):
-            margins.append(
-                self._round_on_faces(placed, *mixed.T).gap + self.rims[mixed[:, 0]]
-            )
+            discs_of_mixed, polygons = mixed.T
+            gap = self._round_on_faces(placed, discs_of_mixed, polygons).gap
+            margins.append(gap + self.rims[discs_of_mixed])
         odd = self._counts[faces].sum(axis=1) % 2 == 1
         if odd.any():
-            a = points[faces[odd, 0]]
-            b = points[faces[odd, 1]]
+            i, j = faces[odd].T
+            a = points[i]
+            b = points[j]
             margins.append(margin_of_places((a, b), facing_sides(a, b)))
         return jnp.min(jnp.concatenate(margins))
 
@@ -376,10 +382,8 @@ class Bodies(RigidBodies):
         distance = number("along", along)
         (n_x, n_y, offset) = self.planes[plane]
         # heights of its points over the centre of mass, along the normal
-        heights = (
-            jnp.sin(turn) * self.points[body, :, 0]
-            + jnp.cos(turn) * self.points[body, :, 1]
-        )
+        x, y = self.points[body].T
+        heights = jnp.sin(turn) * x + jnp.cos(turn) * y
         up = offset + self.rims[body] - jnp.min(heights)
         place = [n_y * distance + n_x * up, n_y * up - n_x * distance]
         return jnp.stack([*place, turn + jnp.arctan2(-n_x, n_y)])

@@ -67,12 +67,17 @@ def sides(corners: jax.Array) -> tuple[jax.Array, jax.Array]:
     return side, outward(side)
 
 
+def angle_in_plane(vector: jax.Array) -> jax.Array:
+    """Angles (..) [rad] of vectors (.., 2) from the x axis, in (-pi, pi]."""
+    return jnp.arctan2(vector[..., -1], vector[..., 0])
+
+
 def outward(side: jax.Array) -> jax.Array:
     """Outward unit normals (s_y, -s_x) / |s| of counter-clockwise sides s (.., 2); 0 of
     s = 0.
     """
     square = dot(side, side)[..., None]
-    turned = jnp.stack([side[..., 1], -side[..., 0]], axis=-1)
+    turned = jnp.stack([side[..., -1], -side[..., 0]], axis=-1)
     return turned / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
@@ -164,10 +169,14 @@ def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
     # side of the other polygon
     opposite = jnp.argmin(dot(normals[::-1], n[:, :, None]), axis=2)
     separation = jnp.max(beyond, axis=2)
-    by_b = separation[1] > separation[0] + PARALLEL  # a side of b separates more
-    first = jnp.where(by_b, opposite[1], own[0])
-    second = jnp.where(by_b, own[1], opposite[0])
-    return Facing(first, second, jnp.where(by_b[:, None], -n[1], n[0]))
+    of_a, of_b = separation
+    by_b = of_b > of_a + PARALLEL  # a side of b separates more
+    own_a, own_b = own
+    opposite_b, opposite_a = opposite
+    first = jnp.where(by_b, opposite_a, own_a)
+    second = jnp.where(by_b, own_b, opposite_b)
+    n_a, n_b = n
+    return Facing(first, second, jnp.where(by_b[:, None], -n_b, n_a))
 
 
 def polygon_on_polygon(
@@ -182,23 +191,27 @@ def polygon_on_polygon(
     `swapped` (g,), else that at its begin.
     """
     corners = jnp.stack([a, b])
-    is_facing = jax.nn.one_hot(jnp.stack(facing[:2]), a.shape[1], dtype=bool)
+    numbers = jnp.stack([facing.first, facing.second])
+    is_facing = jax.nn.one_hot(numbers, a.shape[1], dtype=bool)
     ends = jnp.stack([corners, jnp.roll(corners, -1, axis=2)], axis=3)
     ends = _at_side(is_facing, ends)  # (body, pair, begin or end, x or y)
     begin = ends[:, :, 0]
-    side = ends[:, :, 1] - ends[:, :, 0]
+    side = ends[:, :, -1] - begin
     # the ends of each body's side in the order of the contacts, against the other
     # body's side
     reverse = jnp.stack([swapped, ~swapped])[:, :, None, None]
     ends = jnp.where(reverse, ends[:, :, ::-1], ends)
     others = (x[::-1, :, None] for x in (begin, side, outward(side)))
     gaps, points, normals = _from_side(ends, *others)  # (body, pair, contact, ..)
-    first = gaps[0] <= gaps[1]  # the end of the first side is nearer
-    of_first = first[..., None]
+    gap_a, gap_b = gaps
+    point_a, point_b = points
+    normal_a, normal_b = normals
+    nearer = gap_a <= gap_b  # the end of the first side
+    at_end = nearer[..., None]
     return ContactPoints(
-        jnp.where(first, gaps[0], gaps[1]),
-        jnp.where(of_first, points[0], points[1]),
-        jnp.where(of_first, normals[0], -normals[1]),
+        jnp.where(nearer, gap_a, gap_b),
+        jnp.where(at_end, point_a, point_b),
+        jnp.where(at_end, normal_a, -normal_b),
     )
 
 
@@ -223,11 +236,11 @@ def changed_places(
         counts: numbers of their corners (g,).
         facing: their facing sides.
     """
-    n = facing.normal
-    direction = _CUT + (jnp.arctan2(n[:, 1], n[:, 0]) - _CUT) % (2 * np.pi)
-    number = jnp.zeros(len(n), jnp.int32)
+    angle_of_normal = angle_in_plane(facing.normal)
+    direction = _CUT + (angle_of_normal - _CUT) % (2 * np.pi)
+    number = jnp.zeros(len(direction), jnp.int32)
     # seen from the second polygon, the direction between both is turned by pi
-    each = zip(polygons, angles, counts, facing[:2], (0.0, np.pi))
+    each = zip(polygons, angles, counts, (facing.first, facing.second), (0.0, np.pi))
     for corners, angle, count, side, half_turn in each:
         number += jnp.minimum(side, count - 1).astype(jnp.int32)
         if (count % 2).any():
@@ -247,8 +260,8 @@ def _full_turns(
     to the normal of side 0, and on to that of `side`, each by less than a turn.
     `corners` (g, K, 2) [m].
     """
-    normal = sides(corners)[1]
-    angles = jnp.arctan2(normal[..., 1], normal[..., 0])  # (g, K)
+    _, normals = sides(corners)
+    angles = angle_in_plane(normals)  # (g, K)
     first = angles[:, 0]
     facing = angles[np.arange(len(angles)), side]
     phi = angle + (first - angle) % (2 * np.pi) + (facing - first) % (2 * np.pi)
@@ -300,12 +313,11 @@ def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactP
         repeated.
         """
         each = [1] * (of_discs.ndim - 1)
-        with_disc = jnp.where(both_discs.reshape(-1, *each), of_discs, of_mixed)[
-            :, None
-        ]
+        is_disc = both_discs.reshape(-1, *each)
+        with_disc = jnp.where(is_disc, of_discs, of_mixed)[:, None]
         return jnp.where(any_disc.reshape(-1, 1, *each), with_disc, of_polygons)
 
     gap, point, normal = (chosen(*x) for x in zip(discs, mixed, polygons))
-    return ContactPoints(
-        gap.at[:, 1].add(jnp.where(any_disc, jnp.inf, 0.0)), point, normal
-    )
+    # discs have one contact, polygons two
+    gap = gap.at[:, -1].add(jnp.where(any_disc, jnp.inf, 0.0))
+    return ContactPoints(gap, point, normal)

@@ -48,8 +48,10 @@ def _quaternion_product() -> np.ndarray:
     """
     table = np.zeros((4, 4, 4))
     table[0] = np.diag([1.0, -1.0, -1.0, -1.0])
-    table[1:, 0, 1:] = table[1:, 1:, 0] = np.eye(3)
-    table[1:, 1:, 1:] = _CROSS
+    vector = slice(1, None)
+    table[vector, 0, vector] = np.eye(3)
+    table[vector, vector, 0] = np.eye(3)
+    table[vector, vector, vector] = _CROSS
     return table
 
 
@@ -134,6 +136,11 @@ class RigidBodies(Body):
         return self.planes.shape[1] - 1
 
     @property
+    def plane_normals(self) -> jax.Array:
+        """Unit normals (w, d) of the planes."""
+        return self.planes[:, : self.dimension]
+
+    @property
     def count(self) -> int:
         """Number of bodies that move."""
         return self.masses.shape[0]
@@ -211,7 +218,7 @@ class RigidBodies(Body):
         """
         if not self.quaternions:
             return jnp.zeros_like(v)
-        omega = self.of_bodies(v)[:, 3:]
+        omega = turning_of(self.of_bodies(v))
         if self.inertias.ndim == 2:
             spin = self.inertias * omega
         else:
@@ -224,7 +231,8 @@ class RigidBodies(Body):
         """Margin () of the quaternions' lengths: `UNIT_WITHIN - max | |e| - 1 |`."""
         if not self.quaternions:
             return super().valid(q)
-        return UNIT_WITHIN - jnp.max(jnp.abs(lengths(self.of_bodies(q)[:, 3:])[0] - 1))
+        length, _ = lengths(quaternion_of(self.of_bodies(q)))
+        return UNIT_WITHIN - jnp.max(jnp.abs(length - 1))
 
     @full_precision
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
@@ -236,7 +244,7 @@ class RigidBodies(Body):
         """
         if not self.quaternions:
             return q + u
-        half = 0.5 * self.of_bodies(u)[:, 3:]
+        half = 0.5 * turning_of(self.of_bodies(u))
         cosine, ratio = _cosine_and_sine_ratio(dot(half, half)[:, None])
         return self._turned(q, u, jnp.concatenate([cosine, ratio * half], axis=1))
 
@@ -251,24 +259,22 @@ class RigidBodies(Body):
         """
         if not self.quaternions:
             return q + u
-        half = 0.5 * self.of_bodies(u)[:, 3:]
-        return self._turned(
-            q, u, jnp.concatenate([1 - 0.5 * dot(half, half)[:, None], half], axis=1)
-        )
+        half = 0.5 * turning_of(self.of_bodies(u))
+        scalar = 1 - 0.5 * dot(half, half)[:, None]
+        return self._turned(q, u, jnp.concatenate([scalar, half], axis=1))
 
     def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
         """q moved by the places of u (n,), with quaternions `e f / |e|`, f = `turn` (b,
         4).
         """
-        q, u, table = (
-            self.of_bodies(q),
-            self.of_bodies(u),
-            _QUATERNION_PRODUCT.astype(q.dtype),
-        )
-        _, e = lengths(q[:, 3:])
+        table = _QUATERNION_PRODUCT.astype(q.dtype)
+        q = self.of_bodies(q)
+        u = self.of_bodies(u)
+        _, e = lengths(quaternion_of(q))
         # sum_jk table_ijk e_j f_k
         product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
-        return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
+        place = place_of(q) + place_of(u)
+        return jnp.concatenate([place, product], axis=1).reshape(-1)
 
     @property
     def base_directions(self) -> jax.Array:
@@ -300,11 +306,12 @@ class RigidBodies(Body):
         of space.
         """
         if self.quaternions:
-            return rotation(at[..., 3:])
+            return rotation(quaternion_of(at))
         if self.dimension == 3:  # spheres of a pile: their turns do not matter
             return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (*at.shape[:-1], 3, 3))
-        c = jnp.cos(at[..., 2])
-        s = jnp.sin(at[..., 2])
+        theta = at[..., -1]
+        c = jnp.cos(theta)
+        s = jnp.sin(theta)
         return jnp.stack([c, -s, s, c], axis=-1).reshape(*c.shape, 2, 2)
 
     def placed(self, q: jax.Array) -> Placed:
@@ -341,9 +348,8 @@ class RigidBodies(Body):
         row = body * points.shape[1] + number
         points = points.reshape(-1, d)[row]
         rim = self.rims[body]
-        n = jnp.broadcast_to(
-            self.planes[:, None, :d], (len(self.planes), *points.shape)
-        )
+        shape = (len(self.planes), *points.shape)
+        n = jnp.broadcast_to(self.plane_normals[:, None], shape)
         gap = jnp.sum(n * points[None], axis=2) - self.planes[:, d:] - rim[None]
         point = points[None] - rim[None, :, None] * n
         return ContactPoints(gap.reshape(-1), point.reshape(-1, d), n.reshape(-1, d))
@@ -376,9 +382,8 @@ class RigidBodies(Body):
             )
         directions = jnp.concatenate([directions, self.unit_tangents(normal)], axis=1)
         jacobian = self._relative_jacobian(q, point, directions)
-        return Directions(
-            gap, jacobian[..., 0], jacobian[..., 1:].reshape(len(jacobian), -1)
-        )
+        along_tangents = jacobian[..., 1:].reshape(len(jacobian), -1)
+        return Directions(gap, jacobian[..., 0], along_tangents)
 
     def unit_tangents(self, normal: jax.Array) -> jax.Array:
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
@@ -424,14 +429,14 @@ class RigidBodies(Body):
         k, d).
         """
         pairs = self.pairs_in_contact()
-        # a plane does not move
-        if (pairs[:, 1] >= 0).any():
+        first, second = pairs.T
+        if (second >= 0).any():
             movers = pairs
-        else:
-            movers = pairs[:, :1]
+        else:  # planes do not move
+            movers = first[:, None]
         at = self.of_bodies(q)[movers]
         jacobian = self.contact_jacobian(at, point[:, None], directions[:, None])
-        jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, i or j, k, velocities)
+        jacobian = jacobian.at[:, 1:].multiply(-1.0)  # body j: (m, i or j, k, ..)
         # by JAX: of thousands of bodies only the shapes are needed, and this would fill
         # the memory
         own = (
@@ -557,12 +562,13 @@ class RigidBodies(Body):
         The body, of points (P, 2) [m] with a `rim` [m], is at `at` (x, y, theta), R =
         `turn`.
         """
+        place = at[:-1]
         if shape.is_round:
             spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-            return [at[:2] + (rim * spoke + points[:1]) @ turn.T]
-        ends = at[:2] + points @ turn.T
+            return [place + (rim * spoke + points[0]) @ turn.T]
+        ends = place + points @ turn.T
         if shape.faces:
-            return [np.concatenate([ends, ends[:1]])]
+            return [np.concatenate([ends, ends[[0]]])]
         return [ends, *(end + rim * CIRCLE for end in ends)]
 
     def _space_curves(
@@ -586,9 +592,10 @@ class RigidBodies(Body):
             curve = middle + rim * np.concatenate([flat, np.roll(flat, 1, axis=1)])
         elif shape.faces:
             curve = (points + rim * np.sign(points - middle))[_EDGES]
-        drawn = self.with_shadow(at[:3] + curve @ turn.T)
+        place = place_of(at)
+        drawn = self.with_shadow(place + curve @ turn.T)
         if shape.is_round:
-            return [*drawn, projected(at[:3] + turn @ middle) + rim * CIRCLE]
+            return [*drawn, projected(place + turn @ middle) + rim * CIRCLE]
         if shape.faces:
             return drawn
         return [*drawn, *(end + rim * CIRCLE for end in drawn[0])]
@@ -603,8 +610,9 @@ class RigidBodies(Body):
             plane = np.asarray(self.planes)[0]
         else:
             plane = np.array([0.0, 0, 1, 0])
-        height = curve @ plane[:3] - plane[3]
-        return [projected(curve), projected(curve - np.outer(height, plane[:3]))]
+        *normal, distance = plane
+        height = curve @ normal - distance
+        return [projected(curve), projected(curve - np.outer(height, normal))]
 
 
 class RigidBody(RigidBodies):
@@ -694,6 +702,26 @@ class RigidBody(RigidBodies):
         return _lowered(self, unit_quaternion(_UPRIGHT if turn is None else turn))
 
 
+def place_of(x: Any) -> Any:
+    """The place (.., 3) of poses (.., 7), or of velocities or displacements (.., 6)."""
+    return x[..., :3]
+
+
+def quaternion_of(q: Any) -> Any:
+    """The quaternion (.., 4) of poses (.., 7)."""
+    return q[..., 3:]
+
+
+def turning_of(v: Any) -> Any:
+    """The angular part (.., 3) of velocities or displacements (.., 6)."""
+    return v[..., 3:]
+
+
+def _vector_of(e: jax.Array) -> jax.Array:
+    """The vector a (.., 3) of quaternions e = (s, a)."""
+    return e[..., 1:]
+
+
 @full_precision
 def rotation(e: jax.Array) -> jax.Array:
     """Rotation matrices R (.., 3, 3) of quaternions e = (s, a) (.., 4) of any length.
@@ -701,7 +729,7 @@ def rotation(e: jax.Array) -> jax.Array:
     Equation: `R = I + 2 (s [a]x + a a^T - |a|^2 I) / |e|^2`, `[a]x b = a x b`.
     """
     s = e[..., 0, None, None]
-    a = e[..., 1:]
+    a = _vector_of(e)
     square = dot(e, e)[..., None, None]
     across = jnp.tensordot(a, -_CROSS.astype(e.dtype), (-1, 2))  # [a]x
     outer = a[..., :, None] * a[..., None, :]

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.bodies.base import CIRCLE, lengths, number, positive, positives
-from jimpact.bodies.rigid import ContactPoints, RigidBody, Shape, rotation
+from jimpact.bodies.rigid import (
+    ContactPoints,
+    RigidBody,
+    Shape,
+    place_of,
+    quaternion_of,
+    rotation,
+)
 from jimpact.core.scene import check_mass
 from jimpact.tools.checks import (
     as_float_array,
@@ -554,8 +561,8 @@ class Coin(_SpatialBody):
         """Rotation matrix R (3, 3) at q, and the plane's normal in the body's axes, R^T
         n (3,).
         """
-        turn = rotation(q[3:])
-        return turn, self.planes[0, :3] @ turn
+        turn = rotation(quaternion_of(q))
+        return turn, self.plane_normals[0] @ turn
 
     @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
@@ -566,9 +573,9 @@ class Coin(_SpatialBody):
             return super().contacts(q)
         turn, up = self._toward(q)
         # direction from the axis to them, -(u_1, u_2) / s
-        lowest = -lengths(up[None, :2])[1]
-        points = q[None, :3] + self._rims(lowest) @ turn.T
-        n = jnp.broadcast_to(self.planes[:, :3], points.shape)
+        _, towards = lengths(_across_axis(up)[None])
+        points = place_of(q)[None] + self._rims(-towards) @ turn.T
+        n = jnp.broadcast_to(self.plane_normals, points.shape)
         return ContactPoints(jnp.sum(n * points, axis=1), points, n)
 
     def pairs_in_contact(self) -> np.ndarray:
@@ -582,7 +589,9 @@ class Coin(_SpatialBody):
         length = super().valid(q)
         if self.points.size:
             return length
-        return jnp.minimum(length, lengths(self._toward(q)[1][None, :2])[0][0] - FLAT)
+        _, up = self._toward(q)
+        (s,), _ = lengths(_across_axis(up)[None])
+        return jnp.minimum(length, s - FLAT)
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
         """Projected curves (k, 2) [m] at q: both rims, a diameter of the upper one, and
@@ -596,8 +605,9 @@ class Coin(_SpatialBody):
             ring = CIRCLE
         rims = np.asarray(self._rims(jnp.asarray(ring))).reshape(2, -1, 3)
         across = np.asarray(self._rims(jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])))
-        turn = np.asarray(rotation(jnp.asarray(q)[3:]))
-        curves = [q[:3] + curve @ turn.T for curve in (*rims, across[2:])]
+        turn = np.asarray(rotation(quaternion_of(jnp.asarray(q))))
+        _, diameter = across.reshape(2, -1, 3)  # of the lower and of the upper rim
+        curves = [place_of(q) + curve @ turn.T for curve in (*rims, diameter)]
         return [[line for curve in curves for line in self.with_shadow(curve)]]
 
 
@@ -680,7 +690,8 @@ def _moments_in_space(value: Any) -> jax.Array:
             str(error).replace("`mass`", "`inertia`").replace("M ", "I ")
         ) from None
     moments = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
-    if moments[2] > (1 + _SLACK) * (moments[0] + moments[1]):
+    *others, largest = moments
+    if largest > (1 + _SLACK) * sum(others):
         raise ValueError(
             f"Argument `inertia` must have principal moments none of which is more "
             f"than the sum of the others, but has {moments.tolist()}."
@@ -720,9 +731,14 @@ def _around(corners: jax.Array) -> tuple[int, ...]:
     return tuple(reversed(range(k)))
 
 
+def _across_axis(direction: jax.Array) -> jax.Array:
+    """The part (2,) of a direction (3,) across the axis of a coin, z of its axes."""
+    return direction[:-1]
+
+
 def _cross(a: Any, b: Any) -> Any:
     """Cross products (..) of vectors (.., 2) in the plane."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return a[..., 0] * b[..., -1] - a[..., -1] * b[..., 0]
 
 
 @jax.jit  # operation by operation JAX would compile thirty programs
@@ -749,7 +765,7 @@ def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
     about corner 0 is `sum A_i (a_i^2 + a_i . b_i + b_i^2) / (6 sum A_i)`, less the
     centroid's square.
     """
-    start = ring - ring[:1]  # about a corner: far from the origin, areas would cancel
+    start = ring - ring[None, 0]  # about a corner: far from the origin, areas would cancel
     end = jnp.roll(start, -1, axis=0)
     twice_area = _cross(start, end)  # of the triangles at corner 0
     total = jnp.sum(twice_area)
