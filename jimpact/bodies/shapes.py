@@ -765,7 +765,9 @@ def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
     about corner 0 is `sum A_i (a_i^2 + a_i . b_i + b_i^2) / (6 sum A_i)`, less the
     centroid's square.
     """
-    start = ring - ring[None, 0]  # about a corner: far from the origin, areas would cancel
+    start = (
+        ring - ring[None, 0]
+    )  # about a corner: far from the origin, areas would cancel
     end = jnp.roll(start, -1, axis=0)
     twice_area = _cross(start, end)  # of the triangles at corner 0
     total = jnp.sum(twice_area)

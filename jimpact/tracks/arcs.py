@@ -23,7 +23,7 @@ from scipy.linalg import solveh_banded
 
 from jimpact.tracks.drag import between
 from jimpact.tracks.flight import Flight
-from jimpact.tracks.frames import Frames
+from jimpact.tracks.frames import Frames, neighbours
 from jimpact.tracks.waves import Errors
 
 # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
@@ -76,6 +76,16 @@ class Arcs:
     def impacts(self) -> int:
         """Number K of impacts."""
         return len(self.instants) - 2
+
+    @property
+    def instants_of_impacts(self) -> np.ndarray:
+        """Instants (K,) of the impacts [s]: all ends but the first and the last."""
+        return _inner(self.instants)
+
+    @property
+    def places_of_impacts(self) -> np.ndarray:
+        """Places (K, n) of the impacts [m, rad]."""
+        return _inner(self.places)
 
     @cached_property
     def end_velocities(self) -> tuple[np.ndarray, np.ndarray]:
@@ -131,7 +141,9 @@ class Arcs:
         Drag adds the end rates of `bent` to those of parabolas.
         """
         first, last = self.end_velocities
-        return last[:-1], first[1:]
+        before, _ = neighbours(last)
+        _, after = neighbours(first)
+        return before, after
 
     def gain(self) -> np.ndarray:
         """Derivatives (K, 2, n, N) of v- and v+ in the N unknowns of `covariance`.
@@ -231,6 +243,11 @@ class Arcs:
         return replace(self, members=members)
 
 
+def _inner(ends: np.ndarray) -> np.ndarray:
+    """The values at impacts: those of all ends but the first and the last."""
+    return ends[1:-1]
+
+
 def _in_columns(slopes: np.ndarray, n: int) -> np.ndarray:
     """Slopes (.., 3 n + 3) of `bent_slopes` in the W columns of the unknowns of a
     flight.
@@ -305,8 +322,8 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
     t = frames.t
     flights = [some[np.isfinite(frames.q[some]).any(axis=1)] for some in start.flights]
     pool = np.concatenate(flights)
-    last = np.array([t[some[-1]] for some in flights[:-1]])
-    first = np.array([t[some[0]] for some in flights[1:]])
+    last = np.array([t[before[-1]] for before, _ in pairwise(flights)])
+    first = np.array([t[after[0]] for _, after in pairwise(flights)])
     low = last - BEYOND * frames.step
     high = first + BEYOND * frames.step
     instants = start.instants
@@ -325,8 +342,9 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
         _, change = problem.step(ends, moving & (k > 0))
         new = tau + change.tau
         room = LARGEST_MOVE * np.diff(tau)
-        new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
-        new[1:-1] = np.clip(new[1:-1], low, high)
+        earlier, later = neighbours(room)
+        inner = np.clip(_inner(new), _inner(tau) - earlier, _inner(tau) + later)
+        new = np.concatenate([new[[0]], np.clip(inner, low, high), new[[-1]]])
         moved = change.seconds(new - tau, ends)
         tau = new
         model = ends.flight.moved(change.common)
@@ -419,8 +437,8 @@ class _Members:
         `flights`.
         """
         x = self.t[self.pool]
-        low = np.searchsorted(x, tau[1:-1] + self.contact / 2)
-        high = np.searchsorted(x, tau[1:-1] - self.contact / 2)
+        low = np.searchsorted(x, _inner(tau) + self.contact / 2)
+        high = np.searchsorted(x, _inner(tau) - self.contact / 2)
         starts = np.concatenate([[0], low])
         stops = np.concatenate([high, [len(x)]])
         if (stops - starts).min() < 3:
@@ -573,8 +591,8 @@ class _Problem:
         instant.
         """
         rise = np.diff(ends.places, axis=0) / np.diff(ends.tau)[:, None]
-        whole = np.concatenate([rise[:1], rise, rise[-1:]])
-        return (whole[:-1] + whole[1:]) / 2
+        before, after = neighbours(np.concatenate([rise[[0]], rise, rise[[-1]]]))
+        return (before + after) / 2
 
     def _flights(self) -> list[tuple[int, slice]]:
         """Number and rows of each flight."""
@@ -700,8 +718,8 @@ def _solve(
     solved = scale[:, None] * solveh_banded(
         _scaled(bands, scale), scale[:, None] * both
     )
-    alone = solved[:, 0]
-    by_border = solved[:, 1:]
+    alone, by_border = np.split(solved, [1], axis=1)
+    alone = alone[:, 0]
     schur = np.linalg.pinv(corner - border.T @ by_border, hermitian=True)
     common = schur @ (right_b - border.T @ alone)
     return alone - by_border @ common, common

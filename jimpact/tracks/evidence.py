@@ -18,7 +18,7 @@ import numpy as np
 
 from jimpact.tracks.division import price
 from jimpact.tracks.flight import Flight
-from jimpact.tracks.frames import Frames, least_noise, noise
+from jimpact.tracks.frames import Frames, least_noise, neighbours, noise
 from jimpact.tracks.waves import Covariance, Errors
 
 # Cost by which a flight of another acceleration must be better than an impact to take
@@ -559,7 +559,8 @@ class Likelihood:
         square = 0.0
         for terms, some in ((2, ~self.bent), (3, self.bent)):
             if some.any():
-                log_det += np.linalg.slogdet(grams[some, :terms, :terms])[1].sum()
+                _, logs = np.linalg.slogdet(grams[some, :terms, :terms])
+                log_det += logs.sum()
                 square += float(_rest(grams[some], terms).sum())
         sigma = self.sigma
         if sigma is None:
@@ -712,12 +713,13 @@ def _joined(
     while len(flights) > 1:
         alone = costs.of(flights)
         both = costs.of_pairs(flights)
-        two = alone.least[:-1] + alone.least[1:]
+        two = np.add(*neighbours(alone.least))
         by_line = both.line - two - start
         by_bend = both.least - two + LEAST_GAIN
         saves = np.minimum(by_line, by_bend)
-        around = np.concatenate([[np.inf], saves, [np.inf]])
-        best = (saves <= around[:-2]) & (saves <= around[2:])
+        before = np.append(np.inf, saves)[:-1]
+        _, after = neighbours(np.append(saves, np.inf))
+        best = (saves <= before) & (saves <= after)
         chosen = np.flatnonzero((saves < 0) & best)
         if not chosen.size:
             break
@@ -744,7 +746,7 @@ def doubtful(
     alone = costs.of(flights)
     both = costs.of_pairs(flights)
     extra = frames.q.shape[1]  # values that lines which do not meet have more
-    two = alone.least[:-1] + alone.least[1:]
+    two = np.add(*neighbours(alone.least))
     return both.least < two + LEAST_GAIN + extra
 
 

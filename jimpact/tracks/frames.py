@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -166,6 +167,11 @@ def differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
     if found.size:
         return found
     return all_of(x[np.isfinite(x)])
+
+
+def neighbours(x: Any) -> tuple[Any, Any]:
+    """Entries with a successor, and their successors: x_k and x_(k+1)."""
+    return x[:-1], x[1:]
 
 
 def median(x: np.ndarray) -> float:

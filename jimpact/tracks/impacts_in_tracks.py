@@ -254,8 +254,7 @@ def _in_poses(
     if sigma is not None:
         both = _of_coordinates("sigma", sigma, 6)
         check_values("sigma", both, low=0.0, open_low=True)
-        of_places = both[:3]
-        of_turns = both[3:]
+        of_places, of_turns = np.split(both, 2)
     track = find_impacts(t, places, of_places, acceleration=acceleration, **options)
     if moments is None:
         track = _with_turning_alone(track, e, of_turns, options["shortest"])
@@ -380,9 +379,9 @@ def _as_track(
     pre, post = arcs.velocities()
     covariance = arcs.covariance_of_velocities
     blocks = diagonal_blocks(covariance, 2 * q.shape[1])
-    times = arcs.instants[1:-1] + t.mean()
+    times = arcs.instants_of_impacts + t.mean()
     errors = arcs.instant_errors()
-    places = arcs.places[1:-1]
+    places = arcs.places_of_impacts
     impacts = tuple(
         TrackImpact(
             float(times[k]),

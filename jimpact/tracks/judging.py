@@ -8,7 +8,7 @@ from scipy.stats import chi2, norm
 from jimpact.tools.records import counted, listed
 from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.division import divided
-from jimpact.tracks.frames import Frames, differences, median
+from jimpact.tracks.frames import Frames, differences, median, neighbours
 from jimpact.tracks.held import excess_of
 from jimpact.tracks.search import Search, curvature
 
@@ -96,8 +96,8 @@ def findings_of_turns(
     `p_values` (K,) of orientations that meet at impacts.
     """
     found = []
-    seen = e[np.isfinite(e).all(axis=1)]
-    cosines = np.minimum(np.abs((seen[1:] * seen[:-1]).sum(axis=1)), 1.0)
+    now, then = neighbours(e[np.isfinite(e).all(axis=1)])
+    cosines = np.minimum(np.abs((then * now).sum(axis=1)), 1.0)
     if len(cosines) and np.quantile(2 * np.arccos(cosines), 0.9) > np.pi / 2:
         found.append(
             "The body turns by more than a quarter of a turn from frame to frame: do "

@@ -185,7 +185,8 @@ def _qualisys(path: Path, text: str) -> Capture:
         if _is_number(key) or key.lower() in ("frame", "time") or (head and not key):
             first = k
             break
-        head[key] = [cell.strip() for cell in cells[1:]]
+        _, *words = cells
+        head[key] = [word.strip() for word in words]
     included = (head.get("DATA_INCLUDED") or ["3D"])[0]
     if included != "3D" or "MARKER_NAMES" not in head:
         raise ValueError(
@@ -197,8 +198,10 @@ def _qualisys(path: Path, text: str) -> Capture:
     body = [
         (k + 1, cells) for k, cells in enumerate(lines) if k >= first and any(cells)
     ]
-    if body and not any(_is_number(cell) for _, cells in body[:1] for cell in cells):
-        body = body[1:]  # names of columns
+    if body:
+        (_, cells), *below = body
+        if not any(_is_number(cell) for cell in cells):
+            body = below  # the first row has names of columns
     widest = max((len(cells) - (not cells[-1].strip()) for _, cells in body), default=0)
     before = max(widest - 3 * len(names), 0)  # frame, time
     if before > 2:
@@ -231,6 +234,17 @@ def _stated(path: Path, key: str, cell: str) -> float | None:
     return rate
 
 
+def _without_head(values: np.ndarray) -> np.ndarray:
+    """The columns of markers: those behind the number of the frame and its time."""
+    return values[:, 2:]
+
+
+def _rounding_of_times(body: list[tuple[int, list[str]]]) -> float:
+    """The last digit [s] of times, the second cells of numbered rows."""
+    digits = [len(time.strip().partition(".")[-1]) for _, (_, time, *_) in body]
+    return 10.0 ** -max(digits)
+
+
 def _trc(path: Path, text: str) -> Capture:
     """TRC: keys and values in two rows, names above X1 Y1 Z1; a lost marker is
     empty.
@@ -240,18 +254,19 @@ def _trc(path: Path, text: str) -> Capture:
         raise ValueError(
             f"{path}: a TRC file has five lines of head, this one {len(lines)} in all."
         )
-    keys = [x.strip() for x in lines[1].split("\t")]
-    head = dict(zip(keys, (x.strip() for x in lines[2].split("\t"))))
-    names = [x.strip() for x in lines[3].split("\t")[2:] if x.strip()]
+    cells = [[x.strip() for x in line.split("\t")] for line in lines]
+    _, keys, words, of_markers, _, *rows = cells
+    head = dict(zip(keys, words))
+    _, _, *names = of_markers  # beside Frame# and Time
+    names = [x for x in names if x]
     _check_once(path, names)
-    cells = [(k, line.split("\t")) for k, line in enumerate(lines, 1)]
-    body = [(k, row) for k, row in cells[5:] if any(x.strip() for x in row)]
+    body = [(k, row) for k, row in enumerate(rows, 6) if any(row)]
     values = _rows(path, body, 2 + 3 * len(names))
-    found = _in_threes(names, values[:, 2:])
+    frames, times, *_ = values.T
+    found = _in_threes(names, _without_head(values))
     unit = _unit(path, "Units", head.get("Units", ""))
     rate = _stated(path, "DataRate", head.get("DataRate", ""))
-    digits = max(len(row[1].strip().partition(".")[-1]) for _, row in body)
-    t = _times(path, values[:, 0], values[:, 1], rate, 10.0**-digits)
+    t = _times(path, frames, times, rate, _rounding_of_times(body))
     return Capture("TRC", dict.fromkeys(names, PLACE), found, unit, rate, t)
 
 
@@ -296,7 +311,8 @@ def _optitrack(path: Path, text: str) -> Capture:
     """
     lines = [line.split(",") for line in text.splitlines()]
     first = [x.strip().strip('"') for x in lines[0]]
-    head = dict(zip(first[::2], first[1::2]))
+    keys = first[::2]
+    head = dict(zip(keys, first[1::2]))
     start, names, kinds, axes = _heads_of_optitrack(path, lines)
     places: dict[str, dict[str, int]] = {}
     for k in range(2, len(axes)):
@@ -330,8 +346,8 @@ def _optitrack(path: Path, text: str) -> Capture:
         head.get("Export Frame Rate") or head.get("Capture Frame Rate", ""),
     )
     unit = _unit(path, "Length Units", head.get("Length Units", ""))
-    digits = max(len(x[1].strip().partition(".")[-1]) for _, x in body)
-    t = _times(path, values[:, 0], values[:, 1], rate, 10.0**-digits)
+    frames, times, *_ = values.T
+    t = _times(path, frames, times, rate, _rounding_of_times(body))
     return Capture("OptiTrack CSV", order, found, unit, rate, t)
 
 
@@ -344,12 +360,14 @@ def _heads_of_optitrack(
     Rows are Type, Name, ID, perhaps Parent; older files leave these words out.
     """
     found: list[list[str]] = []
-    for k, cells in enumerate(lines[1:], 1):
+    _, *rows = lines
+    for k, cells in enumerate(rows, 1):
         row = [x.strip().strip('"') for x in cells]
         if row[0] == "Frame":
             kinds = [x for x in found if {"Position", "Rotation"} & set(x)]
-            labelled = [x for x in found if x[1] == "Name"]
-            names = labelled or found[1:2]
+            names = [x for x in found if "Name" in x]
+            if not names:  # without words in front, names are in the second row
+                _, *names = found
             if kinds and names:
                 return k, names[0], kinds[-1], row
         if any(row) and len(row) > 1:
@@ -366,21 +384,22 @@ def _vicon(path: Path, text: str) -> Capture:
     lines = [[x.strip() for x in line.split(",")] for line in text.splitlines()]
     if len(lines) < 5:
         raise ValueError(f"{path}: the part Trajectories has a head of five lines.")
-    rate = _stated(path, "the rate in line 2", lines[1][0])
-    names = [x for x in lines[2] if x]
+    _, (rate_in_words, *_), of_markers, _, of_units, *rows = lines
+    rate = _stated(path, "the rate in line 2", rate_in_words)
+    names = [x for x in of_markers if x]
     _check_once(path, names)
-    units = {x for x in lines[4] if x}
+    units = {x for x in of_units if x}
     if len(units) != 1:
         raise ValueError(
             f"{path}, line 5: all units must be the same, but are {sorted(units)}."
         )
     body = []
-    for k, cells in enumerate(lines[5:], 6):
+    for k, cells in enumerate(rows, 6):
         if not any(cells):
             break
         body.append((k, cells))
     values = _rows(path, body, 2 + 3 * len(names))
-    found = _in_threes(names, values[:, 2:])
+    found = _in_threes(names, _without_head(values))
     frames = values[:, 0]
     if rate is None:
         t = None
@@ -397,11 +416,10 @@ def _c3d(path: Path) -> Capture:
     ezc3d = needed("ezc3d", "pip install 'jimpact[motion-capture]'")
     file = ezc3d.c3d(str(path))
     point = file["parameters"]["POINT"]
-    names = [str(x).strip() for x in point["LABELS"]["value"]][
-        : file["data"]["points"].shape[1]
-    ]
+    x, y, z, _ = file["data"]["points"]  # each of markers and frames
+    names = [str(name).strip() for name in point["LABELS"]["value"]][: len(x)]
     _check_once(path, names)
-    places = np.moveaxis(file["data"]["points"][:3], 0, -1).copy()  # (markers, T, 3)
+    places = np.stack([x, y, z], axis=-1)  # (markers, T, 3)
     lost = file["data"]["meta_points"]["residuals"][0] < 0
     places[lost] = np.nan
     rate = float(point["RATE"]["value"][0])

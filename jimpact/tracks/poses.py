@@ -17,7 +17,7 @@ from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.frames import noise
 from jimpact.tracks.judging import findings_of_noise, findings_of_turns
-from jimpact.tracks.quaternions import turns_since_first
+from jimpact.tracks.quaternions import places_and_turns, turns_since_first
 from jimpact.tracks.track import Track, TrackImpact
 from jimpact.tracks.turning import Turning, fit_turning
 
@@ -131,7 +131,7 @@ def _apart(
     apart = np.zeros(3 * impacts)
     H = np.zeros((3 * impacts, free + 6 * len(flights)))
     columns = arcs.rows_of_instants()
-    for i, instant in enumerate(arcs.instants[1:-1] + zero):
+    for i, instant in enumerate(arcs.instants_of_impacts + zero):
         rows = slice(3 * i, 3 * i + 3)
         own = free + 6 * i
         before, after = (
@@ -158,9 +158,10 @@ def _with_velocities(
     before, after = arcs.velocities()
     impacts = len(before)
     gain = np.zeros((impacts, 3, 6, len(covariance)))
-    gain[:, :, :3, :free] = arcs.gain_with_places()
+    of_places, of_turns = places_and_turns(gain.swapaxes(2, 3))  # views of it
+    of_places[:, :, :free] = arcs.gain_with_places().swapaxes(2, 3)
     rows = arcs.rows_of_instants()
-    times = arcs.instants[1:-1] + track.t.mean()
+    times = arcs.instants_of_impacts + track.t.mean()
     poses = []
     omegas = np.zeros((impacts, 2, 3))
     for k, instant in enumerate(times):
@@ -169,16 +170,18 @@ def _with_velocities(
             first = free + 6 * (k + side)
             at = flight.at(np.array([instant]))
             omegas[k, side] = at.omega[0]
-            gain[k, side, 3:, first : first + 6] = at.omega_slopes[0]
-            gain[k, side, 3:, rows[k]] = flight.rate(at.omega[0])
+            values = slice(first, first + 6)
+            of_turns[k, side, values] = at.omega_slopes[0].T
+            of_turns[k, side, rows[k]] = flight.rate(at.omega[0])
             if side == 0:
-                gain[k, -1, 3:, first : first + 6] = at.turn_slopes[0]
-                gain[k, -1, 3:, rows[k]] = at.omega[0]
+                of_turns[k, -1, values] = at.turn_slopes[0].T
+                of_turns[k, -1, rows[k]] = at.omega[0]
                 quaternion = at.turn[0].as_quat(scalar_first=True)
                 poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
     flat = gain.reshape(18 * impacts, len(covariance))
     with_poses = flat @ covariance @ flat.T
-    velocities = np.arange(18 * impacts).reshape(impacts, 18)[:, :12].ravel()
+    numbers = np.arange(18 * impacts).reshape(impacts, 3, 6)
+    velocities = numbers[:, :-1].ravel()  # before and after, without the poses
     whole = with_poses[np.ix_(velocities, velocities)]
     found = []
     for k, (instant, pose) in enumerate(zip(times, poses)):

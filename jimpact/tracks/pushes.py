@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from jimpact.bodies.base import Body
 from jimpact.core.scene import Scene, dense_mass
 from jimpact.shots.data import ROUNDING
+from jimpact.tracks.quaternions import places_and_turns
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard
 # errors. Ten times more would pass impacts with something else than the contacts.
@@ -88,9 +89,11 @@ class Pushes:
         signs = np.hstack([-np.eye(n), np.eye(n)])
         errors = np.linalg.inv(np.linalg.cholesky(signs @ covariance @ signs.T))
         limit = SHARE_OUT * np.linalg.norm(self.energy @ jump)
-        if self.nearest(errors, jump)[1] <= OUT_OF_CONE:
+        _, missed = self.nearest(errors, jump)
+        if missed <= OUT_OF_CONE:
             return True
-        return bool(self.nearest(self.energy, jump)[1] <= limit)
+        _, missed = self.nearest(self.energy, jump)
+        return bool(missed <= limit)
 
     def after(
         self, before: np.ndarray, impulses: np.ndarray, restitution: float
@@ -146,6 +149,8 @@ def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
     """A pose after a step (n,): of coordinates, or of places and a turn of the body."""
     if len(pose) == len(step):
         return pose + step
-    turn = Rotation.from_quat(pose[3:], scalar_first=True)
-    turned = turn * Rotation.from_rotvec(step[3:])
-    return np.append(pose[:3] + step[:3], turned.as_quat(scalar_first=True))
+    place, e = places_and_turns(pose)
+    displacement, turn = places_and_turns(step)
+    before = Rotation.from_quat(e, scalar_first=True)
+    after = before * Rotation.from_rotvec(turn)
+    return np.append(place + displacement, after.as_quat(scalar_first=True))

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jimpact.tools.checks import check_choice
+from jimpact.tracks.frames import neighbours
 
 ORDERS = {"wxyz": (1, 2, 3, 0), "xyzw": (0, 1, 2, 3)}  # where x, y, z, w stand
 # How far a measured quaternion may be from length 1; with three digits it is off by
@@ -24,7 +25,8 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
             f"Argument `q` must have shape (T, 7), x, y, z and a quaternion, as "
             f"`quaternion` is given, but has shape {q.shape}."
         )
-    e = q[:, 3:][:, np.roll(ORDERS[order], 1)]
+    places, turns = places_and_turns(q)
+    e = turns[:, np.roll(ORDERS[order], 1)]
     length = np.linalg.norm(e, axis=1)
     far = np.abs(length - 1) > LENGTH_WITHIN  # no where a frame is lost
     if far.any():
@@ -34,7 +36,12 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
             f"{k + 1} has length {length[k]:.4g}. Are these angles? A lost frame must "
             f"be NaN, not 0."
         )
-    return q[:, :3], e / length[:, None]
+    return places, e / length[:, None]
+
+
+def places_and_turns(x: Any) -> tuple[Any, Any]:
+    """Parts (.., 3) and (.., 3 or 4): places and turns of poses, steps, velocities."""
+    return x[..., :3], x[..., 3:]
 
 
 def as_inertia(inertia: Any) -> np.ndarray | None:
@@ -74,7 +81,8 @@ def turns_since_first(e: np.ndarray) -> np.ndarray:
     seen = np.isfinite(e).all(axis=1)
     sums = np.full((len(e), 3), np.nan)
     measured = Rotation.from_quat(e[seen], scalar_first=True)
-    steps = (measured[:-1].inv() * measured[1:]).as_rotvec()
+    now, then = neighbours(measured)
+    steps = (now.inv() * then).as_rotvec()
     sums[seen] = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return sums
 
@@ -91,7 +99,9 @@ def in_the_other_order(e: np.ndarray, order: str) -> tuple[np.ndarray, np.ndarra
     else:
         shift = -1
     other = np.roll(e, shift)
-    return other, (_left(other).T @ np.roll(_left(e), shift, axis=0))[1:, 1:]
+    product = _left(other).T @ np.roll(_left(e), shift, axis=0)
+    vectors = slice(1, None)  # rows and columns of x, y, z, without the scalar
+    return other, product[vectors, vectors]
 
 
 def _left(e: np.ndarray) -> np.ndarray:

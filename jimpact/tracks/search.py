@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -279,7 +280,7 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
         frames, clock = with_clock(arcs, search.frames)
         errors = replace(start.errors, sigma=sigma, clock=clock)
         again = replace(
-            start, errors=errors, flight=arcs.flight, instants=arcs.instants[1:-1]
+            start, errors=errors, flight=arcs.flight, instants=arcs.instants_of_impacts
         )
         arcs = _arcs(frames, again)
     return arcs, start.flights
@@ -297,10 +298,13 @@ def _without_false(search: Search, arcs: Arcs, start: Start) -> Start | None:
         return None
     t = search.frames.t
     enough = max(search.settings.shortest - 2, 2)
-    for i, some in enumerate(arcs.members[1:-1], 1):
+    for i, some in enumerate(arcs.members):
+        if i in (0, arcs.impacts):
+            continue  # the first and the last flight
         first, last = arcs.instants[i : i + 2]
         if ((t[some] >= first) & (t[some] <= last)).sum() < enough:
-            return _joined_best(search.frames, start, i)[1]
+            _, joined = _joined_best(search.frames, start, i)
+            return joined
     if (of_residuals(arcs, search.frames) > UNMET * arcs.errors.sigma).any():
         sizes = [np.nanmean(arcs.residual[some] ** 2) for some in arcs.members]
         square, joined = _joined_best(search.frames, start, int(np.argmax(sizes)))
@@ -342,11 +346,11 @@ def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
     bent = np.ones((2, len(waves)), bool)
     at: list[float] = []
     within: list[float] = []
-    for before, after in zip(start.flights, start.flights[1:]):
+    for before, after in pairwise(start.flights):
         two = [before[-near:], after[:near]]
         local = fit_arcs(frames, Start(two, model, white, bent, start.contact))
-        at.append(local.instants[1])
-        within.append(local.instant_errors()[0])
+        at.extend(local.instants_of_impacts)
+        within.extend(local.instant_errors())
     known = replace(start, instants=np.array(at), instant_errors=np.array(within))
     return fit_arcs(frames, known)
 
@@ -371,7 +375,7 @@ def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
             f"{window:g} s leave {min(map(len, near))}."
         )
     contact = search.settings.contact
-    instants = arcs.instants[1:-1]
+    instants = arcs.instants_of_impacts
     start = Start(near, arcs.flight, arcs.errors, arcs.bent, contact, instants)
     return _arcs(search.frames, start)
 

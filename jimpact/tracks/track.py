@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from jimpact.bodies.base import Body
 from jimpact.core.scene import Scene, dense_mass
@@ -14,10 +15,14 @@ from jimpact.shots.data import Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
-from jimpact.tracks.frames import Frames
+from jimpact.tracks.frames import Frames, neighbours
 from jimpact.tracks.held import held_flights
 from jimpact.tracks.pushes import Pushes, slopes_in_pose
-from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
+from jimpact.tracks.quaternions import (
+    in_the_other_order,
+    places_and_turns,
+    turns_since_first,
+)
 
 # Share of the trace by which moments of inertia may differ from those of the body of a
 # scene. Ten times more is a tenth: flights would turn otherwise by degrees.
@@ -52,11 +57,12 @@ class TrackImpact:
 
         omega becomes A omega, with A of `in_the_other_order`; its covariance follows.
         """
-        other, A = in_the_other_order(self.q[3:], order)
-        gain = np.eye(12)
-        gain[3:6, 3:6] = gain[9:, 9:] = A
+        place, e = places_and_turns(self.q)
+        other, A = in_the_other_order(e, order)
+        one = np.eye(3)  # of places, before and after
+        gain = block_diag(one, A, one, A)
         pre, post = np.split(gain @ np.concatenate([self.pre, self.post]), 2)
-        q = np.append(self.q[:3], other)
+        q = np.append(place, other)
         covariance = gain @ self.covariance @ gain.T
         return replace(self, q=q, pre=pre, post=post, covariance=covariance)
 
@@ -106,7 +112,8 @@ class Track:
         """
         if self.order is None:
             return self.q
-        return np.hstack([self.q[:, :3], turns_since_first(self.q[:, 3:])])
+        places, e = places_and_turns(self.q)
+        return np.hstack([places, turns_since_first(e)])
 
     @property
     def acceleration(self) -> np.ndarray:
@@ -275,7 +282,8 @@ class Track:
         n = len(self.acceleration)
         frames = Frames(self.t - self.t.mean(), self.q[:, :n], self.sigma[:n])
         held = held_flights(frames, self.acceleration, self.flights)
-        return ~(held[:-1] | held[1:])
+        before, after = neighbours(held)
+        return ~(before | after)
 
     def _check_inertia(self, body: Body, near: float) -> None:
         """Raise unless the track has poses, and turns with the inertia of this body."""
@@ -286,7 +294,8 @@ class Track:
                 "quaternions (`quaternion`)."
             )
         first = body.scenes([self.impacts[0].q], near)[0]
-        own = dense_mass(first)[3:, 3:]
+        turns = slice(3, None)  # rows of angular velocities
+        own = dense_mass(first)[turns, turns]
         if self.inertia is None:
             given = np.eye(3)
             words = "None, as of a sphere"

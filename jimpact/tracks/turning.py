@@ -9,6 +9,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from jimpact.tracks.frames import neighbours
+
 # Turn [rad] and angular velocity [rad/s] of difference quotients: errors are as many
 # parts of a derivative. Ten times more does no harm; ten times less, and rounding
 # counts as much.
@@ -38,10 +40,10 @@ class Turning:
         """Rotation after a change (6,) of turn, about axes of the body [rad], and of
         omega.
         """
-        turn = self.turn * Rotation.from_rotvec(step[:3])
-        return Turning(
-            self.middle, turn, self.omega + step[3:], self.covariance, self.inertia
-        )
+        turned, change = np.split(step, 2)
+        turn = self.turn * Rotation.from_rotvec(turned)
+        omega = self.omega + change
+        return Turning(self.middle, turn, omega, self.covariance, self.inertia)
 
     def rate(self, omega: np.ndarray) -> np.ndarray:
         """Acceleration `omega' = -I^-1 (omega x I omega)` (3,) [rad/s^2], without
@@ -60,13 +62,13 @@ class Turning:
         starts = [self, *(self.moved(step) for step in SMALL * np.eye(6))]
         turns = Rotation.concatenate([x.turn for x in starts])
         each = np.stack([x.omega for x in starts])
-        turn, omega = free_rotation(turns, each, times - self.middle, self.inertia)
-        turning = [(turn[0].inv() * other).as_rotvec() / SMALL for other in turn[1:]]
+        rotations = free_rotation(turns, each, times - self.middle, self.inertia)
+        turn, *moved_turns = rotations[0]
+        omega, *moved_omegas = rotations[-1]
+        turning = [(turn.inv() * x).as_rotvec() / SMALL for x in moved_turns]
+        changes = [(x - omega) / SMALL for x in moved_omegas]
         return TurningAt(
-            turn[0],
-            omega[0],
-            np.stack(turning, axis=2),
-            np.moveaxis((omega[1:] - omega[0]) / SMALL, 0, 2),
+            turn, omega, np.stack(turning, axis=2), np.stack(changes, axis=2)
         )
 
 
@@ -102,9 +104,7 @@ def free_rotation(
         """Rates of B states: three rows of R, whose rates are `row x omega`, and
         omega.
         """
-        each = state.reshape(count, 4, 3)
-        rows = each[:, :3]
-        w = each[:, 3:]
+        rows, w = np.split(state.reshape(count, 4, 3), [3], axis=1)
         slope = -np.cross(w, w @ inertia) @ inverse  # both are symmetric
         return np.concatenate([np.cross(rows, w), slope], axis=1).ravel()
 
@@ -120,7 +120,8 @@ def free_rotation(
             )
             states[order] = path.y.T
     states = states.reshape(len(since), count, 4, 3).swapaxes(0, 1)
-    return [Rotation.from_matrix(x[:, :3]) for x in states], states[:, :, 3]
+    matrices, omega = np.split(states, [3], axis=2)
+    return [Rotation.from_matrix(x) for x in matrices], omega[:, :, 0]
 
 
 def fit_turning(
@@ -140,7 +141,8 @@ def fit_turning(
     """
     middle = float(t.mean())
     nearest = len(t) // 2
-    steps = (measured[:-1].inv() * measured[1:]).as_rotvec() / np.diff(t)[:, None]
+    now, then = neighbours(measured)
+    steps = (now.inv() * then).as_rotvec() / np.diff(t)[:, None]
     flight = Turning(
         middle, measured[nearest], np.median(steps, axis=0), np.eye(6), inertia
     )
@@ -151,7 +153,8 @@ def fit_turning(
         J = (now.turn_slopes / sigma[:, None]).reshape(-1, 6)
         step = np.linalg.lstsq(J, (rest / sigma).ravel(), rcond=None)[0]
         flight = flight.moved(step)
-        if np.abs(step[:3]).max() < SETTLED:
+        turned, _ = np.split(step, 2)
+        if np.abs(turned).max() < SETTLED:
             break
     covariance = np.linalg.pinv(J.T @ J, hermitian=True)
     rest = (flight.at(t).turn.inv() * measured).as_rotvec()

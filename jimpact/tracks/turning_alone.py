@@ -25,7 +25,7 @@ def with_impacts_of_turning(
     arcs, and True (K,) for impacts of the turning.
     """
     parts: list[np.ndarray] = []
-    instants = list(arcs.instants[1:-1])
+    instants = list(arcs.instants_of_impacts)
     errors = [np.nan] * arcs.impacts
     origin: list[int] = []
     for i, some in enumerate(arcs.members):
@@ -69,4 +69,4 @@ def _parts_of(
     settings = Settings(sigma is None, 0.0, shortest, None)
     search = searched(frames, Flight.of(np.zeros(3)), settings)
     arcs, _ = fitted_arcs(search)
-    return list(arcs.instants[1:-1][~doubts(search, arcs)])
+    return list(arcs.instants_of_impacts[~doubts(search, arcs)])

@@ -176,18 +176,23 @@ def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
     own_fg = w_fg.copy()
     own_gg = w_gg.copy()
     # A^T W A of the step that follows
-    own_ff[:-1] -= (a_ff * m_ff + a_gf * m_gf)[1:]
-    own_fg[:-1] -= (a_ff * m_fg + a_gf * m_gg)[1:]
-    own_gg[:-1] -= (a_fg * m_fg + a_gg * m_gg)[1:]
+    following = slice(1, None)
+    own_ff[:-1] -= (a_ff * m_ff + a_gf * m_gf)[following]
+    own_fg[:-1] -= (a_ff * m_fg + a_gf * m_gg)[following]
+    own_gg[:-1] -= (a_fg * m_fg + a_gg * m_gg)[following]
     bands = np.zeros((BANDS + 1, 2 * len(t)))
     main, one, two, three = bands[::-1]
-    main[::2] = own_ff
-    main[1::2] = own_gg
-    one[1::2] = own_fg
-    one[2::2] = m_fg[1:]  # g of a frame with f of the next one
-    two[2::2] = m_ff[1:]
-    two[3::2] = m_gg[1:]
-    three[3::2] = m_gf[1:]
+    f = slice(0, None, 2)  # rows of the values f of frames
+    g = slice(1, None, 2)
+    next_f = slice(2, None, 2)
+    next_g = slice(3, None, 2)
+    main[f] = own_ff
+    main[g] = own_gg
+    one[g] = own_fg
+    one[next_f] = m_fg[following]  # g of a frame with f of the next one
+    two[next_f] = m_ff[following]
+    two[next_g] = m_gg[following]
+    three[next_g] = m_gf[following]
     return Steps(bands, np.log(det))
 
 
