@@ -41,7 +41,7 @@ ji.plot.system(three, [1.0, 0.0, 0.0], "Three equal balls that touch")
 # ## Three balls
 #
 # Let your engine compute this impact with e = 1, without gravity, friction and damping, and put its
-# velocities here. These are pymunk's, from the table of some thirty engines that comes with jimpact
+# velocities here. These are pymunk's, from the table of some fifty engines that comes with jimpact
 # (`docs/engines.md` says how each was asked).
 
 # %%

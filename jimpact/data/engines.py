@@ -1,4 +1,4 @@
-"""Impacts of several bodies by some thirty physics engines, and the law nearest to
+"""Impacts of several bodies by some fifty physics engines, and the law nearest to
 each.
 """
 
@@ -80,7 +80,8 @@ class EngineImpacts(Tabular):
             v = [*row.velocity, *[None] * (5 - len(row.velocity))]
             cells.append([*row[:4], *v, *row[5:]])
         notes = [
-            "Measured on 28 November 2026; v in units of v1-. See docs/engines.md."
+            "Measured with the versions in the table; v in units of v1-. "
+            "See docs/engines.md."
         ]
         return Table(columns, cells, notes=notes, keys=4)
 
@@ -88,7 +89,7 @@ class EngineImpacts(Tabular):
 def engine_impacts(
     engine: str | None = None, scene: str | None = None
 ) -> EngineImpacts:
-    """Impacts of touching balls by some thirty physics engines, and the nearest laws.
+    """Impacts of touching balls by some fifty physics engines, and the nearest laws.
 
     Each engine was asked for e in its own documented way. Scenes
     `ji.data.ENGINE_SCENES`: S1 three balls, e = 1; S2 five; S3 three, e = .5; S4 two
@@ -104,7 +105,7 @@ def engine_impacts(
     Raises:
         ValueError: no such engine or scene.
 
-    Source: own measurements, 28 November 2026, of the versions in the table; nearest
+    Source: own measurements of the versions in the table; nearest
     laws by `tests/validation/engines/nearest.py`.
 
     >>> import jimpact as ji
