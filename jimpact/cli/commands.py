@@ -605,8 +605,13 @@ _ADVISE_PARAMETERS = (
 _ADVISE_REFUSED = ("tangential_restitution", "initial_energy")
 
 
+# Contacts without friction of which neither is left out: the law compares both already.
+# Ten times more: chains of ten balls are modelled in full where three contacts suffice.
+PAIR_OF_CONTACTS = 2
+
+
 def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
-    """`jimpact advise`: the simplest law that suffices for an impact."""
+    """`jimpact advise`: the simplest law, and scene, that suffice for an impact."""
     study, before, _ = _impact_of(command)
     result = ji.advise(
         study.scene,
@@ -619,7 +624,12 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
         **_advise_parameters(study),
     )
     picture = ji.plot.advice(result, study.title, study.velocities)
-    return CommandResult(_titled(study, before), result, picture, result.table)
+    text = str(result)
+    scene = study.scene
+    if scene.contacts > PAIR_OF_CONTACTS or scene.tangents is not None:
+        enough = ji.simplest_scene(result.law, scene, before, command.tolerance)
+        text = f"{text}\n\n{enough}"
+    return CommandResult(_titled(study, before), result, picture, result.table, text)
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:

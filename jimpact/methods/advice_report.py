@@ -179,8 +179,6 @@ class Advice(Tabular):
         else:
             verdict = "NOT within"
         head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
-        if not self.unknown and any(len(b.contacts) > 1 for b in self.blocks):
-            head[0] += ", if the stiffness ratios are these"
         for line in (self.reason, *_block_lines(self)):
             head += textwrap.wrap(line, _WIDTH)
         if self.unknown:

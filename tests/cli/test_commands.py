@@ -428,6 +428,19 @@ def test_simulate_refuses(tmp_path, capsys, old, new, message):
 
 
 @pytest.mark.slow
+def test_advice_leaves_out_contacts_that_a_chain_does_not_need(tmp_path, capsys):
+    study = tmp_path / "light_end.toml"
+    study.write_text(
+        "[scene]\nmasses_kg = [1.0, 1.2, 1.0, 2e-5]\n"
+        '[law]\nname = "lzb"\nrestitution = 0.8\nstiffness = [1.0, 1.0, 1.0]\n'
+    )
+    speeds = ("--velocity", "1", "0", "0", "0")
+    code, said = call(capsys, "advise", str(study), *speeds)
+    assert code == 0
+    assert re.search(r"2 of 3 contacts suffice within 1 %", said.out)
+
+
+@pytest.mark.slow
 def test_advise(tmp_path, capsys):
     code, said = call(capsys, "advise", "--samples", "32", "--out", tmp_path, "--json")
     result = json.loads(said.out)
