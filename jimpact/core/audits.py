@@ -109,18 +109,17 @@ def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
         residual = residual - scene.tangents @ out.tangential_impulse
     # reactions of the constraints are not listed in `out`
     if scene.constraints is not None:
-        basis = jnp.linalg.qr(scene.constraints)[0]
+        basis, _ = jnp.linalg.qr(scene.constraints)
         residual = residual - basis @ (basis.T @ residual)
     # as `impact` judges: an approach within rounding is not the law's
     rounding = contact.rounding(out.impulse, out.tangential_impulse)
     within = jnp.clip(gamma_plus, -rounding, 0.0)
-    least = jnp.where(scene.closed, (gamma_plus - within) / root, jnp.inf)
-    worst_gap_velocity = jnp.min(least) / size
+    qn_plus = jnp.where(scene.closed, (gamma_plus - within) / root, jnp.inf)
+    worst_gap_velocity = jnp.min(qn_plus) / size
     worst_impulse = jnp.min(out.impulse * root) / size
     gain = (change - out.initial_energy) / size**2
-    off = jnp.abs(residual).max() / jnp.maximum(
-        jnp.abs(momentum(scene, v)).max(), 1e-300
-    )
+    largest = jnp.abs(momentum(scene, v)).max()
+    off = jnp.abs(residual).max() / jnp.maximum(largest, 1e-300)
     tolerance = judged_beyond(out.velocity.dtype, jnp.asarray(out.accuracy))
     return Audit(
         kinematic=worst_gap_velocity >= -tolerance,
@@ -192,26 +191,26 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     if names:
         check_shape("names", np.empty(len(names)), (scene.size,), "one per velocity")
     row = STATUS[int(codes)]
-    before = float(kinetic_energy(scene, velocity))
+    energy = float(kinetic_energy(scene, velocity))
     change = float(out.energy_change)
-    if before:
-        remaining = (before + change) / before
-    else:
-        remaining = float("nan")
-    broken = audit(out, scene, velocity).broken
-    words = [
-        f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES
-    ]
+    remaining = float("nan")
+    if energy:
+        remaining = (energy + change) / energy
+    lines = [f"status         {row.name}: {row.message}"]
     reason = nothing_approaches(scene, velocity)
-    nothing_happens = reason is not None and not np.asarray(out.impulse).any()
-    lines = [
-        f"status         {row.name}: {row.message}",
-        *([f"impact         none: {reason}"] if nothing_happens else []),
-        f"energy         {before:.6g} J before, change {formatted(change, '.6g')} J "
+    if reason is not None and not np.asarray(out.impulse).any():
+        lines.append(f"impact         none: {reason}")
+    words = dict.fromkeys(CONSISTENCIES, "ok")
+    words |= dict.fromkeys(audit(out, scene, velocity).broken, "VIOLATED")
+    judged = ", ".join(f"{name} {word}" for name, word in words.items())
+    unit = f"[{velocity_unit(scene)}]"
+    if names:
+        unit = "velocity"
+    lines += [
+        f"energy         {energy:.6g} J before, change {formatted(change, '.6g')} J "
         f"({100 * remaining:.4g} % kept)",
-        f"audit          {', '.join(words)}",
-        f"coordinate          v-             v+   "
-        f"{'velocity' if names else f'[{velocity_unit(scene)}]'}",
+        f"audit          {judged}",
+        f"coordinate          v-             v+   {unit}",
     ]
     pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
     for i, (a, b) in enumerate(pairs):

@@ -47,8 +47,7 @@ class Contact(eqx.Module):
 
     Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`, with
     normals N, tangents H, W = N^T M^-1 N, W_nt = N^T M^-1 H = W_tn^T, W_tt = H^T M^-1
-    H, slip velocities
-    u = H^T v, normal impulses p and tangential impulses p_t.
+    H, slip velocities u = H^T v, normal impulses p and tangential impulses p_t.
 
     Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no
     stored energy), unless the law uses gaps, and so are contacts that bilateral
@@ -213,21 +212,19 @@ class Contact(eqx.Module):
         finite.
         """
         gamma = self.gap_velocity
-        return (
-            jnp.any(gamma < 0)
-            | jnp.any(self.stored > 0)
-            | ~jnp.all(jnp.isfinite(gamma))
-        )
+        approaches = jnp.any(gamma < 0)
+        stores = jnp.any(self.stored > 0)
+        finite = jnp.all(jnp.isfinite(gamma))
+        return approaches | stores | ~finite
 
     def within(self, noise: jax.Array) -> "Contact":
         """The contact with gap velocities up to `noise` () [m/s] set to 0, as within
         rounding.
         """
         gamma = without_rounding(self.gap_velocity, noise)
+        noise = jnp.maximum(self.noise, noise)
         return eqx.tree_at(
-            lambda contact: (contact.gap_velocity, contact.noise),
-            self,
-            (gamma, jnp.maximum(self.noise, noise)),
+            lambda contact: (contact.gap_velocity, contact.noise), self, (gamma, noise)
         )
 
     def approaching(self, speed: jax.Array) -> "Contact":
@@ -240,9 +237,9 @@ class Contact(eqx.Module):
         """The contact whose laws integrate to `rtol` () where they have none of their
         own.
         """
-        each = jnp.broadcast_to(rtol, self.gap_velocity.shape[:-1])
+        rtol = jnp.broadcast_to(rtol, self.gap_velocity.shape[:-1])
         return eqx.tree_at(
-            lambda contact: contact.rtol, self, each, is_leaf=lambda x: x is None
+            lambda contact: contact.rtol, self, rtol, is_leaf=lambda x: x is None
         )
 
     @full_precision
@@ -267,8 +264,8 @@ class Contact(eqx.Module):
         Equation: `u+ = u- + W_tn p + W_tt p_t`; only where there are tangents.
         """
         assert self.tangential_block is not None
-        cross, tangent, slip = self.tangential_block
-        return slip + cross.T @ normal + tangent @ tangential
+        w_nt, w_tt, u = self.tangential_block
+        return u + w_nt.T @ normal + w_tt @ tangential
 
     @full_precision
     def energy_change(
@@ -279,13 +276,13 @@ class Contact(eqx.Module):
 
         Equation: `(gamma- + gamma+) . p / 2 + (u- + u+) . p_t / 2`.
         """
-        mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
+        gamma_after = self.gap_velocity_after(normal, tangential)
+        mean = 0.5 * (self.gap_velocity + gamma_after)
+        work = mean @ normal
         if tangential is None or self.slip is None:
-            return mean @ normal
-        return (
-            mean @ normal
-            + 0.5 * (self.slip + self.slip_after(normal, tangential)) @ tangential
-        )
+            return work
+        mean_slip = 0.5 * (self.slip + self.slip_after(normal, tangential))
+        return work + mean_slip @ tangential
 
     @property
     def kinetic_angles(self) -> jax.Array:
@@ -327,23 +324,26 @@ def contact_of(
     w = delassus_matrix(scene)
     block = None
     if scene.tangents is not None:
-        moved = solve_mass(scene, scene.tangents)
-        cross = scene.normals.T @ moved
-        tangent = scene.tangents.T @ moved
-        block = TangentialBlock(cross, tangent, scene.tangents.T @ velocity)
+        moved = solve_mass(scene, scene.tangents)  # M^-1 H
+        w_nt = scene.normals.T @ moved
+        w_tt = scene.tangents.T @ moved
+        slip = scene.tangents.T @ velocity
+        block = TangentialBlock(w_nt, w_tt, slip)
     if stored is None:
         stored = jnp.zeros_like(gamma)
     else:
         stored = jnp.broadcast_to(stored, gamma.shape)
+    if scene.constraints is None:
+        norm = jnp.sqrt(diagonal(w))
+    else:
+        norm = kinetic_norm(scene)
     contact = Contact(
         w,
         gamma,
         closed=scene.closed,
         gaps=scene.gaps,
         stored=jnp.where(scene.closed, stored, 0.0).astype(gamma.dtype),
-        norm=jnp.sqrt(diagonal(w))
-        if scene.constraints is None
-        else kinetic_norm(scene),
+        norm=norm,
         noise=noise,
         tangential_block=block,
     )
@@ -351,7 +351,9 @@ def contact_of(
         contact = _without_held(contact, held_by_constraints(scene))
     if scene.gaps is None:
         return contact
-    return _taking_part(contact, scene.gaps < jnp.inf if uses_gaps else contact.closed)
+    if uses_gaps:
+        return _taking_part(contact, scene.gaps < jnp.inf)
+    return _taking_part(contact, contact.closed)
 
 
 @full_precision
@@ -380,8 +382,9 @@ def _without_held(contact: Contact, held: jax.Array) -> Contact:
     Their diagonal entry of W becomes that of the bodies without constraints, |grad
     f_j|^2.
     """
-    own = jnp.diag(jnp.where(held, contact.norm**2, diagonal(contact.delassus)))
-    w = jnp.where(jnp.eye(held.shape[0], dtype=bool), own, contact.normal_delassus)
+    of_diagonal = jnp.where(held, contact.norm**2, diagonal(contact.delassus))
+    on_diagonal = jnp.eye(held.shape[0], dtype=bool)
+    w = jnp.where(on_diagonal, jnp.diag(of_diagonal), contact.normal_delassus)
     closed = contact.closed & ~held
     stored = jnp.where(held, 0.0, contact.stored)
     contact = dataclasses.replace(contact, delassus=w, closed=closed, stored=stored)
@@ -395,14 +398,17 @@ def _taking_part(contact: Contact, part: jax.Array) -> Contact:
     w = decoupled(contact.delassus, part)
     block = contact.tangential_block
     if block is not None:
-        each = block.slip.shape[0] // part.shape[0]  # tangents of a contact
-        rows = jnp.repeat(part, each)
+        tangents = block.slip.shape[0] // part.shape[0]  # of a contact
+        rows = jnp.repeat(part, tangents)
         # a row that takes no part keeps a diagonal entry of the size of W's
-        unit = jnp.diag(jnp.where(rows, 0.0, jnp.repeat(diagonal(w), each)))
+        of_diagonal = jnp.where(rows, 0.0, jnp.repeat(diagonal(w), tangents))
+        decoupled_rows = jnp.diag(of_diagonal)
+        across = part[:, None] & rows[None, :]
+        along = rows[:, None] & rows[None, :]
         block = TangentialBlock(
-            jnp.where(part[:, None] & rows[None, :], block.normal_tangent, 0.0),
-            jnp.where(rows[:, None] & rows[None, :], block.tangent, unit),
-            jnp.where(rows, block.slip, 0.0),
+            normal_tangent=jnp.where(across, block.normal_tangent, 0.0),
+            tangent=jnp.where(along, block.tangent, decoupled_rows),
+            slip=jnp.where(rows, block.slip, 0.0),
         )
     gamma = jnp.where(part, contact.gap_velocity, 0.0)
     gaps = jnp.where(part, contact.gaps, 1.0)
@@ -430,7 +436,7 @@ def rounded_gap_velocity(
     else:
         left, right = scene.walls
         padded = jnp.pad(speed, (int(left), int(right)))
-        size = padded[:-1] + padded[1:]
+        size = _sums_of_neighbours(padded)
     noise = jax.lax.stop_gradient(precision(speed.dtype).rounding * size)
     return without_rounding(gamma, noise), noise
 
@@ -459,7 +465,13 @@ def delassus_matrix(scene: Scene) -> Symmetric:
     inverse = 1 / scene.mass
     padded = jnp.pad(inverse, (int(left), int(right)))
     shared = inverse[int(not left) : scene.size - int(not right)]
-    return Tridiagonal(padded[:-1] + padded[1:], -shared, scene.contacts <= scene.size)
+    regular = scene.contacts <= scene.size
+    return Tridiagonal(_sums_of_neighbours(padded), -shared, regular)
+
+
+def _sums_of_neighbours(x: jax.Array) -> jax.Array:
+    """`x_j + x_j+1` of a chain's bodies, one for each contact between two of them."""
+    return x[:-1] + x[1:]
 
 
 def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
@@ -471,10 +483,12 @@ def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
     if isinstance(delassus, Sparse):
         return delassus.within(closed)
     if isinstance(delassus, Tridiagonal):
-        off = jnp.where(closed[:-1] & closed[1:], delassus.off_diagonal, 0.0)
+        of_both = closed[:-1] & closed[1:]
+        off = jnp.where(of_both, delassus.off_diagonal, 0.0)
         return Tridiagonal(delassus.diagonal, off, delassus.regular)
-    keep = (closed[:, None] & closed[None, :]) | jnp.eye(closed.shape[0], dtype=bool)
-    return jnp.where(keep, delassus, 0.0)
+    of_both = closed[:, None] & closed[None, :]
+    on_diagonal = jnp.eye(closed.shape[0], dtype=bool)
+    return jnp.where(of_both | on_diagonal, delassus, 0.0)
 
 
 def kinetic_norm(scene: Scene) -> jax.Array:
@@ -594,7 +608,8 @@ def coupled_groups(scene: Scene) -> Groups | None:
         return None
     moves = np.asarray(scene.normals) != 0
     if tangents is not None:
-        moves |= (np.asarray(tangents) != 0).reshape(len(moves), m, -1).any(axis=2)
+        along = np.asarray(tangents) != 0
+        moves |= along.reshape(len(moves), m, -1).any(axis=2)
     touched = [moves[:, members]]
     if scene.mass.ndim == 2:
         touched.append(np.asarray(scene.mass) != 0)
@@ -617,18 +632,20 @@ def _by_size(groups: list[np.ndarray], m: int) -> Groups:
     groups = sorted(groups, key=len)  # stable
     size = np.array([len(group) for group in groups])
     smaller = np.arange(len(groups))  # number of groups in the first array
-    entries = smaller * size[smaller - 1] ** 2 + (len(groups) - smaller) * size[-1] ** 2
+    larger = len(groups) - smaller
+    entries = smaller * size[smaller - 1] ** 2 + larger * size[-1] ** 2
+    cut = 0
     if entries[0] > WORTH_A_PROGRAM * entries.min():
         cut = int(np.argmin(entries))
-    else:
-        cut = 0
 
     def padded(part: list[np.ndarray]) -> np.ndarray:
         """Groups (c, g), each padded to the length g of the last one, see `Groups`."""
-        most = len(part[-1])
-        return np.stack(
-            [np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part]
-        )
+        *_, longest = part
+        rows = []
+        for group in part:
+            missing = len(longest) - len(group)
+            rows.append(np.pad(group, (0, missing), constant_values=m + group[0]))
+        return np.stack(rows)
 
     return tuple(padded(part) for part in (groups[:cut], groups[cut:]) if part)
 
@@ -648,37 +665,35 @@ def contacts_of_groups(
         gaps = jnp.zeros_like(gamma)
     else:
         gaps = scene.gaps
-    # tangents of a contact
-    if scene.tangents is None:
-        each = 0
-    else:
-        each = scene.tangents.shape[1] // m
+    tangents_each = 0  # of a contact
     columns = scene.normals  # (N, H)
     if scene.tangents is not None:
+        tangents_each = scene.tangents.shape[1] // m
         columns = jnp.concatenate([columns, scene.tangents], axis=1)
         slip = scene.tangents.T @ velocity
     moved = solve_mass(scene, columns)  # M^-1 (N, H)
-    if scene.constraints is None:
-        held = None
-    else:
+    held = None
+    if scene.constraints is not None:
         held = held_by_constraints(scene)
 
     def contacts_of(padded: np.ndarray) -> Contact:
         """The contacts of padded groups (c, g), see `Groups`."""
         index = padded % m
-        g = index.shape[1]
-        tangents = each * index[:, :, None] + jnp.arange(each)[None, None, :]
-        tangents = tangents.reshape(len(index), each * g)  # columns of H of each group
-        directions = jnp.concatenate([index, m + tangents], axis=1)  # of (N, H)
+        c, g = index.shape
+        # columns of H of each group, then of (N, H)
+        of_contact = jnp.arange(tangents_each)[None, None, :]
+        tangents = tangents_each * index[:, :, None] + of_contact
+        tangents = tangents.reshape(c, tangents_each * g)
+        directions = jnp.concatenate([index, m + tangents], axis=1)
         part = jnp.asarray(padded < m) & scene.closed[index]
         # [[W, W_nt], [W_tn, W_tt]] of each group
-        matrix = jnp.einsum(
-            "nca,ncb->cab", columns[:, directions], moved[:, directions]
-        )
-        if each:
-            block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents])
-        else:
-            block = None
+        left = columns[:, directions]
+        matrix = jnp.einsum("nca,ncb->cab", left, moved[:, directions])
+        block = None
+        if tangents_each:
+            w_nt = matrix[:, :g, g:]
+            w_tt = matrix[:, g:, g:]
+            block = TangentialBlock(w_nt, w_tt, slip[tangents])
         contact = Contact(
             matrix[:, :g, :g],
             gamma[index],

@@ -91,12 +91,10 @@ class Uniform(Distribution):
         self, key: jax.Array, size: int, dtype: Any, non_negative: bool
     ) -> jax.Array:
         """One draw (size,): `low + (high - low) u`, u uniform in [0, 1)."""
-        low, high = (
-            jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high)
-        )
-        return jnp.minimum(
-            low + (high - low) * jax.random.uniform(key, (size,), dtype), high
-        )
+        low = jnp.broadcast_to(self.low, (size,)).astype(dtype)
+        high = jnp.broadcast_to(self.high, (size,)).astype(dtype)
+        u = jax.random.uniform(key, (size,), dtype)
+        return jnp.minimum(low + (high - low) * u, high)  # rounding only
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
         """Raise a ValueError for another shape, and, where `non_negative`, for a `low`
@@ -143,13 +141,14 @@ class Normal(Distribution):
         """One draw (size,): `mean + std z`, z normal; `non_negative`: truncated at
         0.
         """
-        mean, std = (
-            jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std)
-        )
+        mean = jnp.broadcast_to(self.mean, (size,)).astype(dtype)
+        std = jnp.broadcast_to(self.std, (size,)).astype(dtype)
         if not non_negative:
-            return mean + std * jax.random.normal(key, (size,), dtype)
-        unit = jax.random.truncated_normal(key, -mean / std, jnp.inf, (size,), dtype)
-        return jnp.maximum(mean + std * unit, 0)  # rounding only
+            z = jax.random.normal(key, (size,), dtype)
+            return mean + std * z
+        lowest = -mean / std
+        z = jax.random.truncated_normal(key, lowest, jnp.inf, (size,), dtype)
+        return jnp.maximum(mean + std * z, 0)  # rounding only
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
         """Raise a ValueError for another shape, and, where `non_negative`, for a mean
@@ -248,9 +247,8 @@ class RandomLaw(eqx.Module):
         known = free_parameters_of(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
             old, path, _ = known[name]
-            new = distribution.sample(
-                jax.random.fold_in(key, i), old.size, old.dtype, False
-            )
+            own_key = jax.random.fold_in(key, i)
+            new = distribution.sample(own_key, old.size, old.dtype, False)
             law = eqx.tree_at(operator.attrgetter(path), law, new.reshape(old.shape))
         return law
 
@@ -275,11 +273,10 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
         warn_without_key(name, value)
         return value
     array = as_float_array(name, value)
-    several = array.ndim == 2
-    shape = (len(array), size) if several else (size,)
-    as_numbers(
-        name, array, shape, "one sample a row" if several else "or one sample a row"
-    )
+    if array.ndim == 2:
+        as_numbers(name, array, (len(array), size), "one sample a row")
+    else:
+        as_numbers(name, array, (size,), "or one sample a row")
     if non_negative and np.any(np.asarray(array) < 0):
         where = np.argwhere(np.asarray(array) < 0)[0].tolist()
         raise ValueError(
@@ -294,7 +291,9 @@ def warn_without_key(name: str, function: Callable[[jax.Array], Any]) -> None:
     samples.
     """
     program = jax.make_jaxpr(function)(jax.random.key(0, impl="threefry2x32")).jaxpr
-    if not any(program.invars[0] is x for step in program.eqns for x in step.invars):
+    (key,) = program.invars
+    read = [x for step in program.eqns for x in step.invars]
+    if not any(x is key for x in read):
         warnings.warn(
             f"Argument `{name}` draws without its key: it is compiled once, and the "
             f"same in all "
@@ -309,10 +308,12 @@ def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
     number.
     """
     low, high = domain.bounds
-    least, most = (
-        (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
-    )
-    if np.min(least) < low or np.max(most) > high:
+    smallest: Any = -np.inf
+    largest: Any = np.inf
+    if isinstance(drawn, Uniform):
+        smallest = drawn.low
+        largest = drawn.high
+    if np.min(smallest) < low or np.max(largest) > high:
         raise ValueError(
             f"Argument `{name}` must lie in [{low:g}, {high:g}], but {drawn!r} can "
             f"leave it."

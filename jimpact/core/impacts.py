@@ -102,8 +102,7 @@ def impact(
 
     Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (a + b) / 2`,
     `a = (gamma+ + gamma-)^T p`, `b = (u+ + u-)^T p_t`; N (n, m) holds the contact
-    normals,
-    H (n, t) the tangents, u = H^T v are the slip velocities.
+    normals, H (n, t) the tangents, u = H^T v are the slip velocities.
 
     Independent groups of contacts (two pairs of balls in one scene) are solved
     separately if the scene is known, not traced, and the law allows it
@@ -163,21 +162,26 @@ def impact(
         if not is_traced(rtol):
             check_rtol(float(rtol), v.dtype)
     given = _Given(
-        *(
-            None if x is None else jnp.asarray(x, v.dtype)
-            for x in (noise, approach, rtol)
-        )
+        noise=_as_given(noise, v.dtype),
+        approach=_as_given(approach, v.dtype),
+        rtol=_as_given(rtol, v.dtype),
     )
     if scene.gaps is not None and not law.uses_gaps:
         _warn_of_unused_gaps(law, scene, v)
+    groups = None
     if is_separable(law):
         groups = coupled_groups(scene)
-    else:
-        groups = None
     if groups is None and _shares_a_program(law, scene, v, given):
         return _impact_of_padded_scene(law, scene, v, given)
     with naming_the_adjoint():
         return _impact(law, scene, v, groups, given, Traced.of(law, scene, v, given))
+
+
+def _as_given(value: Any, dtype: Any) -> jax.Array | None:
+    """A number of the caller's as an array (); None if it is not given."""
+    if value is None:
+        return None
+    return jnp.asarray(value, dtype)
 
 
 def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
@@ -258,8 +262,9 @@ class Traced(NamedTuple):
         root of its energy `sum gamma-^2 / W_jj`; `finite` () is True where its results
         are finite.
         """
+        _, _, v, _ = arguments
         code = jnp.where(finite, code, CODE["not_finite"])
-        code = jnp.where(_has_scale(size, arguments[2]), code, CODE["out_of_range"])
+        code = jnp.where(_has_scale(size, v), code, CODE["out_of_range"])
         if any(self):
             refused = self._refusal(*arguments)
             code = jnp.where(refused > CODE["ok"], refused, code)
@@ -282,13 +287,15 @@ class Traced(NamedTuple):
         if self.constrained:
             allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))
         if self.given:
-            allowed += [(x >= 0) & (x < jnp.inf) for x in given if x is not None]
+            numbers = [x for x in given if x is not None]
+            allowed += [(x >= 0) & (x < jnp.inf) for x in numbers]
         if self.given and given.rtol is not None:
-            allowed.append((given.rtol >= precision(v.dtype).noise) & (given.rtol <= 1))
-        code = jnp.where(
-            jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"]
-        )
-        return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
+            resolved = given.rtol >= precision(v.dtype).noise
+            allowed.append(resolved & (given.rtol <= 1))
+        all_allowed = jnp.all(jnp.asarray(allowed))
+        any_unknown = jnp.any(jnp.asarray(unknown, bool))
+        code = jnp.where(all_allowed, CODE["ok"], CODE["out_of_range"])
+        return jnp.where(any_unknown, CODE["not_finite"], code)
 
 
 def _shares_a_program(law: Law, scene: Scene, v: jax.Array, given: _Given) -> bool:
@@ -315,10 +322,10 @@ def _impact_of_padded_scene(
     velocity[padded.coordinates] = v
     on_host = restrict_law(jax.tree.map(np.asarray, law), padded.copied)
     out = _impact(on_host, padded.scene, velocity, None, given, Traced())
+    v_plus = np.asarray(out.velocity)[padded.coordinates]
+    p = np.asarray(out.impulse)[padded.contacts]
     return dataclasses.replace(
-        out,
-        velocity=jnp.asarray(np.asarray(out.velocity)[padded.coordinates]),
-        impulse=jnp.asarray(np.asarray(out.impulse)[padded.contacts]),
+        out, velocity=jnp.asarray(v_plus), impulse=jnp.asarray(p)
     )
 
 
@@ -377,9 +384,8 @@ def _impact(
     total = jnp.sum(stored)
     code = jnp.where(change > total + outcome.noise, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
-    finite = (
-        jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
-    )
+    finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p))
+    finite = finite & jnp.isfinite(change)
     # no scale can be out of range without an impact
     size = jnp.where(happens, outcome.size, 1.0)
     code = traced.status((law, scene, v, given), code, size, finite)
@@ -444,7 +450,12 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     code = jnp.where(happens, code, CODE["ok"])
     noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
     return _Resolved(
-        p, tangential, code, contact.size, noise, jnp.asarray(accuracy, p.dtype)
+        normal=p,
+        tangential=tangential,
+        status=code,
+        size=contact.size,
+        noise=noise,
+        accuracy=jnp.asarray(accuracy, p.dtype),
     )
 
 
@@ -492,20 +503,18 @@ def _in_groups(
         group, and the stored energy (m,) [J].
     """
     m = scene.contacts
-    stored = jnp.where(
-        scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0
-    )
+    stored = jnp.broadcast_to(law.stored, (m,)).astype(v.dtype)
+    stored = jnp.where(scene.closed, stored, 0.0)
     batches = [given.applied(c) for c in contacts_of_groups(scene, v, stored, groups)]
     active = [
         jax.vmap(lambda contact: contact.happens)(contacts) for contacts in batches
     ]
     happens = jnp.any(jnp.concatenate(active))
     p = jnp.zeros(m, v.dtype)
-    if scene.tangents is None:
-        each = 0
-    else:
-        each = scene.tangents.shape[1] // m
-    tangential = jnp.zeros((m, each), v.dtype)
+    tangents = 0  # of a contact
+    if scene.tangents is not None:
+        tangents = scene.tangents.shape[1] // m
+    tangential = jnp.zeros((m, tangents), v.dtype)
     code = jnp.asarray(CODE["ok"])
     square = jnp.zeros((), v.dtype)
     noise = jnp.zeros((), v.dtype)
@@ -521,20 +530,26 @@ def _in_groups(
             return _resolved(restrict_law(law, index), contact, acts)
 
         if len(index) == 1:  # without the cost of a batch
-            one = resolve_group(*jax.tree.map(lambda x: x[0], (index, contacts, acts)))
-            part = jax.tree.map(lambda x: jnp.asarray(x)[None], one)
+            group = jax.tree.map(lambda x: x[0], (index, contacts, acts))
+            resolved = resolve_group(*group)
+            part = jax.tree.map(lambda x: jnp.asarray(x)[None], resolved)
         else:
             part = jax.vmap(resolve_group)(index, contacts, acts)
-        at = padded.reshape(-1)
-        p = p.at[at].set(part.normal.reshape(-1), mode="drop")
-        rows = part.tangential.reshape(len(at), each)
-        tangential = tangential.at[at].set(rows, mode="drop")
+        members = padded.reshape(-1)
+        p = p.at[members].set(part.normal.reshape(-1), mode="drop")
+        rows = part.tangential.reshape(len(members), tangents)
+        tangential = tangential.at[members].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
         square = square + jnp.sum(part.size**2)
         noise = noise + jnp.sum(part.noise)
         accuracy = jnp.maximum(accuracy, jnp.max(part.accuracy))
     outcome = _Resolved(
-        p, tangential.reshape(-1), code, jnp.sqrt(square), noise, accuracy
+        normal=p,
+        tangential=tangential.reshape(-1),
+        status=code,
+        size=jnp.sqrt(square),
+        noise=noise,
+        accuracy=accuracy,
     )
     return outcome, happens, stored
 
@@ -550,7 +565,8 @@ def _signs(
     """
     root = jnp.sqrt(diagonal(contact.delassus))
     # the sign of an impulse that only undoes the rounding of v- is not judged
-    floor = tolerance + jnp.sqrt(jnp.sum((ROUNDING_PUSHES * contact.noise / root) ** 2))
+    rounding = ROUNDING_PUSHES * contact.noise / root
+    floor = tolerance + jnp.sqrt(jnp.sum(rounding**2))
     pull = jnp.any(p * root < -floor)
     after = contact.gap_velocity_after(p, tangential) + contact.rounding(p, tangential)
     approach = jnp.any(contact.closed & (after / root < -tolerance))

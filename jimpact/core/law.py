@@ -165,7 +165,9 @@ class Option:
     name: str = "option"
 
     def __call__(self, value: Any) -> Any:
-        """The value, checked; None stays None."""
+        """The value that the converter gives, if there is one, which checks it; else
+        the value itself, one of the choices, or within its bounds, or None.
+        """
         if self.converter is not None:
             return self.converter(value)
         if self.choices is not None:
@@ -422,16 +424,14 @@ def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
     """Parameters that are arrays, not None or static numbers: they can be fitted and
     sampled.
     """
-    return {
-        k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)
-    }
+    known = parameters_of(module)
+    return {name: x for name, x in known.items() if eqx.is_inexact_array(x.value)}
 
 
 def with_parameter(module: Any, name: str, value: Any) -> Any:
     """The law with another value of one of its parameters, or of those of its parts."""
-    return eqx.tree_at(
-        operator.attrgetter(parameters_of(module)[name].path), module, value
-    )
+    path = parameters_of(module)[name].path
+    return eqx.tree_at(operator.attrgetter(path), module, value)
 
 
 def value_of(law: "Law", field: str) -> Any:
@@ -443,9 +443,8 @@ def value_of(law: "Law", field: str) -> Any:
 
 def entries(law: "Law", fields: tuple[str, ...]) -> np.ndarray:
     """All entries (Q,) of these fields of a law, one field after the other."""
-    return np.concatenate(
-        [np.ravel(np.asarray(value_of(law, f), float)) for f in fields]
-    )
+    values = [np.asarray(value_of(law, field), float) for field in fields]
+    return np.concatenate([np.ravel(value) for value in values])
 
 
 def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
@@ -455,9 +454,10 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
     start = 0
     for field in fields:
         old = value_of(law, field)
-        new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
+        end = start + old.size
+        new = values[start:end].reshape(old.shape).astype(old.dtype)
         law = with_parameter(law, field, jnp.asarray(new))
-        start += old.size
+        start = end
     return law
 
 
@@ -621,15 +621,17 @@ def _forwarded(name: str) -> property:
 
 def with_option(law: AnyLaw, name: str, chosen: Any) -> AnyLaw:
     """The law, and laws within it, with this value of an option where they have it."""
-    fields = dataclasses.fields(law)
-    if not any(f.name == name or isinstance(getattr(law, f.name), Law) for f in fields):
+    values = {f.name: getattr(law, f.name) for f in dataclasses.fields(law)}
+    has_laws = any(isinstance(value, Law) for value in values.values())
+    if name not in values and not has_laws:
         return law
     new = object.__new__(type(law))
-    for field in fields:
-        value = getattr(law, field.name)
+    for field, value in values.items():
         if isinstance(value, Law):
             value = with_option(value, name, chosen)
-        object.__setattr__(new, field.name, chosen if field.name == name else value)
+        if field == name:
+            value = chosen
+        object.__setattr__(new, field, value)
     return new
 
 
@@ -646,12 +648,8 @@ def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
     """
     for name, (value, _, domain) in parameters_of(law).items():
         ndim = np.ndim(value)
-        if (
-            value is None
-            or not domain.per_contact
-            or ndim == 0
-            or (domain.matrix and ndim == 2)
-        ):
+        is_matrix = domain.matrix and ndim == 2
+        if value is None or not domain.per_contact or ndim == 0 or is_matrix:
             continue
         check_shape(
             name, value, (scene.contacts,), "one entry per contact, or a scalar"
@@ -670,10 +668,13 @@ def is_separable(law: Law) -> bool:
 
     The law says so, its parameters are scalars or (m,), and open contacts take no part.
     """
-    known = all(
-        x.domain.per_contact and np.ndim(x.value) < 2 and not isinstance(x.value, tuple)
-        for x in parameters_of(law).values()
-    )
+
+    def of_contacts(x: Parameter) -> bool:
+        """True for a scalar, or an array with one entry a contact."""
+        plain = np.ndim(x.value) < 2 and not isinstance(x.value, tuple)
+        return x.domain.per_contact and plain
+
+    known = all(of_contacts(x) for x in parameters_of(law).values())
     return law.separable and known and not law.uses_gaps
 
 
@@ -681,6 +682,11 @@ def restrict_law(law: Law, contacts: jax.Array) -> Law:
     """The law of the contacts with these indices (k,): their entries of parameters
     (m,).
     """
-    return jax.tree.map(
-        lambda x: x[contacts] if eqx.is_array(x) and x.ndim == 1 else x, law
-    )
+
+    def restricted(x: Any) -> Any:
+        """The entries of these contacts of an array (m,); all else as it is."""
+        if eqx.is_array(x) and x.ndim == 1:
+            return x[contacts]
+        return x
+
+    return jax.tree.map(restricted, law)

@@ -30,12 +30,10 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     """Bases `n_q` (n, m) and `t_q` (n, n - m - b) of the kinetic quasi-velocities.
 
     Equation: `n_q = M^-1 N diag(1 / |grad f_j|)`, `t_q^T M n_q = 0`,
-    `t_q^T grad h = 0`,
-    `t_q^T M t_q = I` (so that `D_t = I`).
+    `t_q^T grad h = 0`, `t_q^T M t_q = I` (so that `D_t = I`).
 
     Column i of t_q comes from a coordinate: the n - m - b coordinates with the largest
-    shares
-    (in the kinetic metric) in the tangent space are projected onto it and
+    shares (in the kinetic metric) in the tangent space are projected onto it and
     orthonormalized in their order; each column forms an acute angle with what is left
     of its coordinate. A chain without walls: `(1, ..., 1) / sqrt(sum m)`.
 
@@ -78,15 +76,14 @@ def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     all_contacts = _with_constraints_as_contacts(scene)
     metric = jax.vmap(partial(momentum, scene), 1, 1)  # M X
     gram = as_matrix(normalized_delassus(all_contacts))
-    unit = (
-        jnp.eye(all_contacts.contacts, dtype=gram.dtype)
-        / kinetic_norm(all_contacts)[:, None]
-    )
+    one = jnp.eye(all_contacts.contacts, dtype=gram.dtype)
+    unit = one / kinetic_norm(all_contacts)[:, None]
     normal = jax.vmap(partial(velocity_change, all_contacts), 1, 1)(unit)
     identity = jnp.eye(scene.size, dtype=gram.dtype)
     projector = identity - normal @ jnp.linalg.solve(gram, metric(normal).T)
     count = scene.size - all_contacts.contacts
-    tangent = projector[:, _coordinates(metric(projector), metric(identity), count)]
+    coordinates = _coordinates(metric(projector), metric(identity), count)
+    tangent = projector[:, coordinates]
     triangle = jnp.linalg.cholesky(tangent.T @ metric(tangent))
     tangent = jax.scipy.linalg.solve_triangular(triangle, tangent.T, lower=True).T
     return normal[:, : scene.contacts], tangent
@@ -122,11 +119,8 @@ def check_independent(scene: Scene) -> None:
     norm = np.sqrt(np.diag(gram))
     smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
     if smallest < precision(gram.dtype).singular * len(gram):
-        raise ValueError(
-            _REDUNDANT.format(
-                f"redundant ones: smallest eigenvalue of G {smallest:.3g}"
-            )
-        )
+        given = f"redundant ones: smallest eigenvalue of G {smallest:.3g}"
+        raise ValueError(_REDUNDANT.format(given))
 
 
 def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
@@ -149,13 +143,12 @@ def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
         """
         rest, chosen = state
         squares = jnp.diagonal(rest)  # of what no chosen direction spans
-        pivot = jnp.argmax(squares >= (1 - _EQUAL_SHARE) * jnp.max(squares)).astype(
-            jnp.int32
-        )
+        equal = squares >= (1 - _EQUAL_SHARE) * jnp.max(squares)
+        pivot = jnp.argmax(equal).astype(jnp.int32)
         column = rest[:, pivot]
-        return rest - jnp.outer(column, column) / squares[pivot], chosen.at[i].set(
-            pivot
-        )
+        rest = rest - jnp.outer(column, column) / squares[pivot]
+        return rest, chosen.at[i].set(pivot)
 
     start = (gram, jnp.zeros(count, jnp.int32))
-    return jnp.sort(jax.lax.fori_loop(0, count, choose, start)[1])
+    _, chosen = jax.lax.fori_loop(0, count, choose, start)
+    return jnp.sort(chosen)

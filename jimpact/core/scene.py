@@ -198,20 +198,22 @@ class Scene(eqx.Module):
         return ""
 
     def __str__(self) -> str:
-        """Lines with the sizes n and m, masses, normals and gaps."""
+        """Lines with the kind, the sizes n and m, masses, the first six normals (none
+        of a chain or of pairs), and gaps if given.
+        """
         kind = "scene"
         if self.walls is not None:
+            kind = "chain"
+        if self.walls is not None and any(self.walls):
             walls = next(name for name, sides in WALLS.items() if sides == self.walls)
-            kind = "chain" + (f" (wall: {walls})" if any(self.walls) else "")
+            kind = f"chain (wall: {walls})"
         size = counted(self.size, "velocity", "velocities")
         lines = [f"{kind} of {size} and {counted(self.contacts, 'contact')}"]
         if self.mass.ndim == 1:
-            mass = self.mass
+            lines.append(f"mass     {in_numbers(self.mass)}")
         else:
-            mass = jnp.diagonal(self.mass, axis1=-2, axis2=-1)
-        lines.append(
-            f"mass     {in_numbers(mass)}{'' if self.mass.ndim == 1 else ' (diagonal)'}"
-        )
+            diagonal = jnp.diagonal(self.mass, axis1=-2, axis2=-1)
+            lines.append(f"mass     {in_numbers(diagonal)} (diagonal)")
         if self.walls is None and self.pairs is None:
             lines += [
                 f"normal {j + 1} {in_numbers(n)}"
@@ -337,6 +339,13 @@ def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
     return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)
 
 
+def _columns(matrix: jax.Array | None) -> int:
+    """Number of columns of a matrix (n, k), 0 of None."""
+    if matrix is None:
+        return 0
+    return matrix.shape[1]
+
+
 def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
     """The scenes padded to one number of contacts and of coordinates, and how many are
     added.
@@ -349,15 +358,14 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
         ValueError: tangents in some scenes only, planar and spatial ones, or other
             numbers of coordinates or constraints.
     """
-    structures = [jax.tree.flatten(s) for s in scenes]
-    if len({(tree, tuple(map(np.shape, leaves))) for leaves, tree in structures}) == 1:
+    structures = set()
+    for scene in scenes:
+        leaves, tree = jax.tree.flatten(scene)
+        structures.add((tree, tuple(map(np.shape, leaves))))
+    if len(structures) == 1:
         return list(scenes), 0
-    tangents = {
-        0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes
-    }
-    constraints = {
-        0 if s.constraints is None else s.constraints.shape[1] for s in scenes
-    }
+    tangents = {_columns(s.tangents) // s.contacts for s in scenes}
+    constraints = {_columns(s.constraints) for s in scenes}
     sizes = {s.size for s in scenes}
     for what, numbers in (
         ("tangents a contact", tangents),
@@ -370,12 +378,14 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
                 f"have "
                 f"{' and '.join(map(str, sorted(numbers)))}."
             )
-    (each,) = tangents  # of a contact
-    most = max(s.contacts for s in scenes)
+    (tangents_each,) = tangents  # of a contact
+    counts = [s.contacts for s in scenes]
+    contacts = max(counts)
     # a coordinate for each direction
-    extra = (most - min(s.contacts for s in scenes)) * (1 + each)
+    extra = (contacts - min(counts)) * (1 + tangents_each)
     dense = any(s.mass.ndim == 2 for s in scenes)
-    return [_with_open_contacts(s, most, s.size + extra, dense) for s in scenes], extra
+    padded = [_with_open_contacts(s, contacts, s.size + extra, dense) for s in scenes]
+    return padded, extra
 
 
 def _with_open_contacts(
@@ -472,7 +482,8 @@ def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
     mass: Any = np.asarray(scene.mass)
     gaps = _padded_gaps(scene, missing)
     # bodies are added on the left, as the chain must end at its right wall
-    if scene.walls[1]:
+    _, right = scene.walls
+    if right:
         mass = np.concatenate([np.resize(mass[1::-1], missing)[::-1], mass])
         padded = chain_scene(mass, scene.walls, np.roll(gaps, missing))
         inside = slice(missing, None)
@@ -755,9 +766,9 @@ def _check_directions(scene: Scene) -> None:
         kinetic = np.linalg.solve(np.linalg.cholesky(mass), columns).T
     length = np.linalg.norm(kinetic, axis=1, keepdims=True)
     unit = (kinetic / np.where(length > 0, length, 1.0)).reshape(m, -1, n)
-    least = np.linalg.eigvalsh(unit @ np.swapaxes(unit, 1, 2))[:, 0]
+    smallest = np.linalg.eigvalsh(unit @ np.swapaxes(unit, 1, 2))[:, 0]
     # more directions than coordinates always depend on each other
-    dependent = (least < _DEPENDENT) & (n >= unit.shape[1])
+    dependent = (smallest < _DEPENDENT) & (n >= unit.shape[1])
     oblique = _is_oblique(dense_mass(scene), np.moveaxis(directions, 1, 0))
     if dependent.any():
         warnings.warn(
@@ -829,9 +840,10 @@ def is_allowed(scene: Scene) -> jax.Array:
     NaN is not looked for; a dense M that is not positive definite gives energies
     without a value, a normal that is zero gives a contact without a scale.
     """
-    allowed = [
-        jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)
-    ]
+    if scene.mass.ndim == 1:
+        allowed = [jnp.all(scene.mass > 0)]
+    else:
+        allowed = [_is_symmetric(scene.mass)]
     if scene.gaps is not None:
         allowed.append(jnp.all(scene.gaps >= 0))
     return jnp.all(jnp.asarray(allowed))

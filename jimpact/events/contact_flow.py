@@ -6,44 +6,44 @@ With sqrt-energy units (see `impact_dynamics.py`) and frozen geometry the law re
     x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j,
     gamma' = G F + K_nt lambda,    u' = K_tn F + K_tt lambda
 
-with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1)
-/ 2. In expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units
-of the smallest e of these contacts: nothing is then divided by e, so that e = 0 is an
-ordinary, differentiable case (the whole expansion takes no time; derivatives in e there
-are one-sided).
+with stored energy x_j^(eta_j + 1) / 2. A law states F and c (`ContactEquations`); LZB
+has c_j = 1 in compression and 1/e_j^2 in expansion. In expansion g_j = gamma_j / e_j
+takes the place of gamma_j, and time runs in units of the smallest e of these contacts:
+nothing is then divided by e, so that e = 0 is an ordinary, differentiable case (the
+whole expansion takes no time; derivatives in e there are one-sided).
 
-STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each). A
-flow that
-               `watches` its exponents has one more before the time.
-MODES (rows)   phase (m), how often each contact has closed (m); with friction the slip:
-0 sticks,
-               +-1 the direction (m).
+STATE (rows)   x, g, p (m each, `Contacts`), time; with friction slip u and its impulse
+               (t each). A flow that `watches` its exponents has one more before the
+               time.
+MODES (rows)   phase, how often each contact has closed, with friction the slip: 0
+               sticks, +-1 the direction (m each, `Modes`).
 
 A contact is OPEN, in COMPRESSION or in EXPANSION. Without gaps the geometry is frozen:
 an open contact closes as soon as gamma < 0. With gaps (`gapped`) it keeps track of x =
 -gap and closes when that returns to 0. A `viscous` force replaces the power law; it
-never pulls, so that a contact
-may be SLACK: x > 0, and no force. It opens at x = 0, from SLACK or, with what force it
-has there, from COMPRESSION. With a `limit` of x the force is bounded: the contact
-YIELDS at
-x = limit until it expands, and what it takes up meanwhile is lost.
+never pulls, so that a contact may be SLACK: x > 0, and no force. It opens at x = 0,
+from SLACK or, with what force it has there, from COMPRESSION. With a `limit` of x the
+force is bounded: the contact YIELDS at x = limit until it expands, and what it takes up
+meanwhile is lost.
 """
 
 import dataclasses
 import enum
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jimpact.numerics.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.numerics.sparse import Neighbours, neighbour_sum
 from jimpact.numerics.stepper import Flow, any_of, total
 from jimpact.numerics.tangents import without_slope
 from jimpact.numerics.tridiagonal import tridiagonal_product
+from jimpact.tools.masks import quotient
 
 
 class Phase(enum.IntEnum):
@@ -121,11 +121,43 @@ def per_row(values: Exponent, like: Float[Array, "m *B"]) -> Float[Array, "#m *#
     return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
+def smallest_of(s: Float[Array, "m B"]) -> Float[Array, "1 B"]:
+    """The smallest s_j; of several equal ones, one has the whole derivative."""
+    m = s.shape[0]
+    if m <= COLUMNS_WRITTEN_OUT:
+        rows = [s[j : j + 1] for j in range(m)]
+        return functools.reduce(lambda a, b: jnp.where(b < a, b, a), rows)
+    j = jnp.argmin(s, axis=0, keepdims=True)
+    return jnp.take_along_axis(s, j, axis=0)
+
+
+def largest_of(x: Shaped[Array, "k *B"]) -> Shaped[Array, "1 *B"]:
+    """The largest of the rows."""
+    return jnp.max(x, axis=0, keepdims=True)
+
+
 def plus_one(exponent: Exponent) -> Exponent:
     """`exponent + 1`, static where `exponent` is."""
     if isinstance(exponent, tuple):
         return tuple(e + 1 for e in exponent)
     return exponent + 1
+
+
+class ContactEquations(NamedTuple):
+    """The equations of a contact that stores and returns energy; a law states them.
+
+    They are functions of module level, which programs are compiled for; see
+    `laws/lzb.py`. Units are their arguments' own: a flow calls them without dimension.
+    """
+
+    force: Callable[..., Any]  # F(x, k, eta)
+    scale: Callable[..., Any]  # s(expands, e): x' = -gamma / s^2
+    depth: Callable[..., Any]  # x(q, k, eta) at which the energy q^2 / 2 is stored
+
+
+def is_power_of_two(n: Int[Array, "1 *B"]) -> Bool[Array, "1 *B"]:
+    """Mask: n is 1, 2, 4, 8, ..."""
+    return (n > 0) & (n & (n - 1) == 0)
 
 
 class Viscous(NamedTuple):
@@ -175,6 +207,7 @@ class Viscous(NamedTuple):
 
 # fields of flows and couplings that are no arrays: they belong to the program
 COMPILED_IN = (
+    "equations",
     "exponent_static",
     "gapped",
     "closed_form",
@@ -197,14 +230,16 @@ def as_pytree(kind: type[T]) -> type[T]:
 
     def flatten(tree: T) -> tuple[list[Any], tuple[Any, ...]]:
         """Values of the fields that are arrays, and of the others."""
-        return [getattr(tree, name) for name in arrays], tuple(
-            getattr(tree, n) for n in fixed
-        )
+        leaves = [getattr(tree, name) for name in arrays]
+        structure = tuple(getattr(tree, name) for name in fixed)
+        return leaves, structure
 
     def unflatten(structure: tuple[Any, ...], leaves: Any) -> T:
         """The inverse of `flatten`."""
         tree = object.__new__(kind)
-        for name, value in zip((*arrays, *fixed), (*leaves, *structure)):
+        for name, value in zip(arrays, leaves):
+            object.__setattr__(tree, name, value)
+        for name, value in zip(fixed, structure):
             object.__setattr__(tree, name, value)
         return tree
 
@@ -310,6 +345,42 @@ class Frozen(NamedTuple):
     scale: Float[Array, "m B"]  # s_j = gamma / g
 
 
+class Contacts(NamedTuple):
+    """Rows of a state, or of its rates, that all flows have: m of each kind."""
+
+    x: Float[Array, "m B"]  # indentations
+    g: Float[Array, "m B"]  # gamma / s
+    p: Float[Array, "_ B"]  # impulses; none within a step without friction
+
+
+class Modes(NamedTuple):
+    """Rows of modes: m of each kind."""
+
+    phase: Int[Array, "m B"]
+    closings: Int[Array, "m B"]  # how often each contact has closed
+    slip: Int[Array, "_ B"]  # none without friction
+
+    def packed(self) -> Int[Array, "modes B"]:
+        """The rows as one array."""
+        return jnp.concatenate(self)
+
+
+class Margins(NamedTuple):
+    """Rows of margins, or of the mask of those that are events: m of each kind.
+
+    What the rows mean depends on the mode of each contact, see `normal_margins`.
+    """
+
+    by_x: Shaped[Array, "m B"]  # by indentation
+    by_g: Shaped[Array, "m B"]  # by velocity
+    slip: Shaped[Array, "_ B"]  # slip stops; none without friction
+    cone: Shaped[Array, "_ B"]  # stick, or creep, ends; none without friction
+
+    def packed(self) -> Shaped[Array, "k B"]:
+        """The rows as one array."""
+        return jnp.concatenate(self)
+
+
 class ContactStates(NamedTuple):
     """Forces and motion of the contacts in a state, dimensionless."""
 
@@ -333,10 +404,11 @@ class ContactFlow(Flow):
     """
 
     coupling: Coupling
-    omega: Float[Array, "m B"]  # (m, B)
-    restitution: Float[Array, "m B"]  # (m, B)
-    exponent_array: Float[Array, "m B"] | None  # (m, B)
-    tolerance: Float[Array, "1 B"]  # (1, B)
+    equations: ContactEquations
+    omega: Float[Array, "m B"]
+    restitution: Float[Array, "m B"]
+    exponent_array: Float[Array, "m B"] | None
+    tolerance: Float[Array, "1 B"]
     taking_part: Float[Array, "1 B"]  # contacts that are not open for good
     viscous: Viscous | None = None
     limit: Float[Array, "m B"] | None = None  # indentation at which the force stays
@@ -387,22 +459,45 @@ class ContactFlow(Flow):
             return (self.contacts, 1, 1)
         return (self.contacts, 1)
 
-    def rows(
-        self, y: Float[Array, "driving B"]
-    ) -> tuple[Float[Array, "m B"], Float[Array, "m B"], Float[Array, "_ B"]]:
-        """Rows of a state: indentations x, g = gamma / s, impulses p (none within a
-        step).
-        """
+    def rows(self, y: Float[Array, "driving B"]) -> Contacts:
+        """Rows of a state: indentations x, g = gamma / s, impulses p."""
         m = self.contacts
-        return y[:m], y[m : 2 * m], y[2 * m : 3 * m]
+        return Contacts(x=y[:m], g=y[m : 2 * m], p=y[2 * m : 3 * m])
+
+    def with_rows(self, y: Float[Array, "n B"], rows: Contacts) -> Float[Array, "n B"]:
+        """The state with these rows x, g and p, its other rows as they are."""
+        return jnp.concatenate([*rows, y[3 * self.contacts :]])
+
+    def modes(self, modes: Int[Array, "modes B"]) -> Modes:
+        """Rows of modes: phases, closings, slip."""
+        m = self.contacts
+        return Modes(phase=modes[:m], closings=modes[m : 2 * m], slip=modes[2 * m :])
+
+    def kinds(self, margins: Shaped[Array, "k B"]) -> Margins:
+        """Rows of margins, or of the mask of events, by kind."""
+        m = self.contacts
+        return Margins(
+            by_x=margins[:m],
+            by_g=margins[m : 2 * m],
+            slip=margins[2 * m : 3 * m],
+            cone=margins[3 * m :],
+        )
+
+    def side_impulse(self, y: Float[Array, "n B"]) -> Float[Array, "t B"]:
+        """Tangential impulse of a state: none without friction."""
+        return y[:0]
 
     def start(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state before the impact; a touching contact at rest starts in
-        compression.
+        """Modes and state before the impact: no contact has closed, no impulse acted.
+
+        A contact starts OPEN where it is apart, x < 0, or separates without load; in
+        EXPANSION, if forces do not slacken, where it separates under load, but OPEN and
+        unloaded there if e = 0; else, also touching at rest, in COMPRESSION.
         """
-        phase = jnp.where((gamma <= 0) | (x > 0), Phase.COMPRESSION, Phase.OPEN)
+        closed = (gamma <= 0) | (x > 0)
+        phase = jnp.where(closed, Phase.COMPRESSION, Phase.OPEN)
         phase = jnp.where(x < 0, Phase.OPEN, phase)
         expands = (x > 0) & (gamma > 0)
         if not self.slackens:
@@ -411,20 +506,24 @@ class ContactFlow(Flow):
         spent = (phase == Phase.EXPANSION) & (self.restitution == 0)
         phase = jnp.where(spent, Phase.OPEN, phase)
         x = jnp.where(spent, 0.0, x)
-        g = gamma / jnp.where(phase == Phase.EXPANSION, self.restitution, 1.0)
+        g = gamma / self.equations.scale(phase == Phase.EXPANSION, self.restitution)
         modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
-        last = jnp.zeros_like(g[:1])
+        p = jnp.zeros_like(g)
+        time = jnp.zeros_like(self.tolerance)
+        watched = time
         if self.watches:
-            watched = [last]
-        else:
-            watched = []
-        return modes, jnp.concatenate([x, g, jnp.zeros_like(g), *watched, last])
+            return modes, jnp.concatenate([x, g, p, watched, time])
+        return modes, jnp.concatenate([x, g, p, time])
 
     def scales(self, modes: Int[Array, "modes B"]) -> Float[Array, "m B"]:
-        """`s_j = gamma_j / g_j`: e_j in expansion, otherwise 1."""
-        return jnp.where(
-            modes[: self.contacts] == Phase.EXPANSION, self.restitution, 1.0
-        )
+        """`s_j = gamma_j / g_j`: of LZB's equations e_j in expansion, otherwise 1."""
+        expands = self.modes(modes).phase == Phase.EXPANSION
+        return self.equations.scale(expands, self.restitution)
+
+    def loaded(self, modes: Int[Array, "modes B"]) -> Bool[Array, "m B"]:
+        """Mask of the contacts in compression or expansion."""
+        phase = self.modes(modes).phase
+        return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
 
     # ---- the protocol
 
@@ -436,18 +535,11 @@ class ContactFlow(Flow):
 
     def normal_constants(self, modes: Int[Array, "modes B"]) -> Frozen:
         """Factors of the normal field in the phases of the contacts."""
-        phase = modes[: self.contacts]
+        phase = self.modes(modes).phase
         s = self.scales(modes)
-        # the least s makes e = 0 regular; of several equal ones, one: min() would share
-        # its derivative among them
-        if self.contacts <= COLUMNS_WRITTEN_OUT:
-            least = functools.reduce(
-                lambda a, b: jnp.where(b < a, b, a),
-                [s[j : j + 1] for j in range(self.contacts)],
-            )
-        else:
-            least = jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
-        ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)
+        # time in units of the smallest s makes e = 0 regular
+        unit = smallest_of(s)
+        ratio = quotient(unit, s, where=s > 0, otherwise=1.0)
         if self.gapped:
             moves = jnp.ones_like(phase, bool)
         else:
@@ -458,16 +550,18 @@ class ContactFlow(Flow):
             loaded = loaded | (phase == Phase.YIELD)
         closing = jnp.where(moves, -ratio * self.omega, 0.0)
         stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
-        return Frozen(least, ratio, closing, jnp.where(loaded, stiffness, 0.0), s)
+        stiffness = jnp.where(loaded, stiffness, 0.0)
+        return Frozen(unit, ratio, closing, stiffness, scale=s)
 
     def force(
         self, const: Frozen, x: Float[Array, "m B"], g: Float[Array, "m B"]
     ) -> Float[Array, "m B"]:
-        """Normal forces `F = stiffness x^eta`; p' = unit F by the time in units of
-        `s*`.
+        """Normal forces F(x, stiffness, eta) of the law's equations, `p' = unit F`.
+
+        Of a viscous model `F(x, -g)` while the contact is loaded, otherwise 0.
         """
         if self.viscous is None:
-            return const.stiffness * power(x, self.exponent)
+            return self.equations.force(x, const.stiffness, self.exponent)
         return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
 
     def field(
@@ -479,14 +573,14 @@ class ContactFlow(Flow):
         """
         x, g, _ = self.rows(y)
         f = self.force(const, x, g)
+        dx = const.closing * g
         dg = const.ratio * self.coupling.times(f)
-        watched = []
-        if self.watches:
-            slope = f * jnp.log(jnp.where(x > 0, x, 1.0))
-            watched = [jax.lax.stop_gradient(const.unit * total(slope))]
-        return jnp.concatenate(
-            [const.closing * g, dg, const.unit * f, *watched, const.unit]
-        )
+        dp = const.unit * f
+        if not self.watches:
+            return jnp.concatenate([dx, dg, dp, const.unit])
+        slope = f * jnp.log(jnp.where(x > 0, x, 1.0))
+        watched = jax.lax.stop_gradient(const.unit * total(slope))
+        return jnp.concatenate([dx, dg, dp, watched, const.unit])
 
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
@@ -496,7 +590,10 @@ class ContactFlow(Flow):
         """
         if not self.watches:
             return 1.0
-        return jnp.ones_like(y[:, :1]).at[-2].set(WATCHED)
+        one = jnp.ones((3 * self.contacts, 1), y.dtype)
+        watched = jnp.full((1, 1), WATCHED, y.dtype)
+        time = jnp.ones((1, 1), y.dtype)
+        return jnp.concatenate([one, watched, time])
 
     def margins(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
@@ -512,30 +609,27 @@ class ContactFlow(Flow):
         """Margins that are >= 0 while a contact keeps its phase: m by indentation, m by
         velocity.
 
-            phase         by indentation               by velocity
-            OPEN          1; with gaps -x              g + NEGLIGIBLE tolerance; with
-            gaps 1 COMPRESSION   1; with a limit limit - x    -g
-            EXPANSION     x                            g
-            YIELD         1                            -g
+            phase         by indentation              by velocity
+            OPEN          1; with gaps -x             g + NEGLIGIBLE tolerance;
+                                                      with gaps 1
+            COMPRESSION   1; with a limit limit - x   -g
+            EXPANSION     x                           g
+            YIELD         1                           -g
 
-        Where forces slacken: the onset in COMPRESSION, minus the onset in SLACK; x in
-        both.
+        Where forces slacken, by indentation the onset in COMPRESSION, minus the onset
+        in SLACK; by velocity x in both.
         """
         x, g, _ = self.rows(y)
-        phase = modes[: self.contacts]
+        phase = self.modes(modes).phase
         by_x = jnp.where(phase == Phase.EXPANSION, x, 1.0)
         by_g = jnp.where(phase == Phase.COMPRESSION, -g, g)
         if self.limit is not None:
             by_x = jnp.where(phase == Phase.COMPRESSION, self.limit - x, by_x)
             by_g = jnp.where(phase == Phase.YIELD, -g, by_g)
         if not self.gapped:
-            return jnp.concatenate(
-                [
-                    by_x,
-                    by_g
-                    + jnp.where(phase == Phase.OPEN, NEGLIGIBLE * self.tolerance, 0.0),
-                ]
-            )
+            idle = NEGLIGIBLE * self.tolerance
+            by_g = by_g + jnp.where(phase == Phase.OPEN, idle, 0.0)
+            return jnp.concatenate([by_x, by_g])
         by_x = jnp.where(phase == Phase.OPEN, -x, by_x)
         by_g = jnp.where(phase == Phase.OPEN, 1.0, by_g)
         if self.slackens:
@@ -550,7 +644,7 @@ class ContactFlow(Flow):
         """Mask of the margins that are openings: x falls to 0 like the square of the
         time left.
         """
-        phase = modes[: self.contacts]
+        phase = self.modes(modes).phase
         opens = phase == Phase.EXPANSION
         by_g = (phase == Phase.COMPRESSION) & self.slackens
         return jnp.concatenate([opens, by_g])
@@ -572,53 +666,61 @@ class ContactFlow(Flow):
         y: Float[Array, "n B"],
         which: Bool[Array, "k B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Phases, closings, x and g after events: m by indentation, then m by velocity.
+        """Phases, closings, x and g after events by indentation and by velocity.
 
-        An event ends the phase whose margin it is: OPEN closes to COMPRESSION, which
-        turns to EXPANSION (or YIELD), which opens or is compressed again. See
-        `normal_margins`. The state has no slopes where it is `at_corner`.
+        An event ends the phase whose margin it is, see `normal_margins`. Where forces
+        slacken: `_slackening`; elsewhere: `_turning`. The state has no slopes where it
+        is `at_corner`.
         """
-        m = self.contacts
-        phase = modes[:m]
-        count = modes[m : 2 * m]
-        by_x = which[:m]
-        by_g = which[m : 2 * m]
+        phase, closings, slip = self.modes(modes)
+        by_x, by_g, _, _ = self.kinds(which)
         if self.slopes:
             y = jnp.where(self.at_corner(phase, y, by_g), without_slope(y), y)
-        x, g, _ = self.rows(y)
         if self.slackens:
-            after = self._slackening(phase, by_x, by_g)
-            opened = by_g & (phase != Phase.OPEN)
             closed = by_x & (phase == Phase.OPEN)
-            x = jnp.where(opened | closed, 0.0, x)
+            after, rows = self._slackening(phase, self.rows(y), by_x, by_g)
         else:
-            opened = by_x & (phase == Phase.EXPANSION)
             closed = (by_x | by_g) & (phase == Phase.OPEN)
-            # what is left in it would do nothing more: it need not be unloaded
-            idle = (
-                power(x, plus_one(self.exponent)) <= (NEGLIGIBLE * self.tolerance) ** 2
-            )
-            turned = by_g & (phase == Phase.COMPRESSION)
-            after = jnp.where(
-                turned, jnp.where(idle, Phase.OPEN, Phase.EXPANSION), phase
-            )
-            if self.limit is not None:
-                yields = by_x & (phase == Phase.COMPRESSION) & ~turned
-                after = jnp.where(yields, Phase.YIELD, after)
-                x = jnp.where(yields, self.limit, x)
-                after = jnp.where(by_g & (phase == Phase.YIELD), Phase.EXPANSION, after)
-            after = jnp.where(
-                by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after
-            )
-            after = jnp.where(
-                opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after)
-            )
-            g = jnp.where(opened, self.restitution * g, g)
-            g = jnp.where(by_g & (phase != Phase.OPEN), 0.0, g)
-            x = jnp.where(opened | (turned & idle) | (closed & self.gapped), 0.0, x)
-        count = count + closed.astype(count.dtype)
-        modes = jnp.concatenate([after, count, modes[2 * m :]]).astype(modes.dtype)
-        return modes, jnp.concatenate([x, g, y[2 * m :]])
+            after, rows = self._turning(phase, self.rows(y), by_x, by_g)
+        closings = closings + closed.astype(closings.dtype)
+        packed = Modes(after, closings, slip).packed().astype(modes.dtype)
+        return packed, self.with_rows(y, rows)
+
+    def _turning(
+        self,
+        phase: Int[Array, "m B"],
+        rows: Contacts,
+        by_x: Bool[Array, "m B"],
+        by_g: Bool[Array, "m B"],
+    ) -> tuple[Int[Array, "m B"], Contacts]:
+        """Phases and rows after events of forces that last as long as the indentation.
+
+        OPEN closes to COMPRESSION, with gaps at x = 0. COMPRESSION turns to EXPANSION
+        at g = 0, or to OPEN at x = 0 where what is left in it would do nothing more;
+        with a limit it goes on to YIELD at x = limit, and YIELD to EXPANSION at g = 0.
+        EXPANSION ends OPEN at x = 0, with gamma = e g, or in COMPRESSION at g = 0.
+        """
+        x, g, p = rows
+        opened = by_x & (phase == Phase.EXPANSION)
+        closed = (by_x | by_g) & (phase == Phase.OPEN)
+        turned = by_g & (phase == Phase.COMPRESSION)
+        left = power(x, plus_one(self.exponent))
+        idle = left <= (NEGLIGIBLE * self.tolerance) ** 2
+        turns_to = jnp.where(idle, Phase.OPEN, Phase.EXPANSION)
+        after = jnp.where(turned, turns_to, phase)
+        if self.limit is not None:
+            yields = by_x & (phase == Phase.COMPRESSION) & ~turned
+            x = jnp.where(yields, self.limit, x)
+            after = jnp.where(yields, Phase.YIELD, after)
+            after = jnp.where(by_g & (phase == Phase.YIELD), Phase.EXPANSION, after)
+        after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)
+        after = jnp.where(closed, Phase.COMPRESSION, after)
+        after = jnp.where(opened, Phase.OPEN, after)
+        g = jnp.where(opened, self.restitution * g, g)
+        g = jnp.where(by_g & (phase != Phase.OPEN), 0.0, g)
+        at_zero = opened | (turned & idle) | (closed & self.gapped)
+        x = jnp.where(at_zero, 0.0, x)
+        return after, Contacts(x, g, p)
 
     def at_corner(
         self,
@@ -643,32 +745,42 @@ class ContactFlow(Flow):
     def _slackening(
         self,
         phase: Int[Array, "m B"],
+        rows: Contacts,
         by_x: Bool[Array, "m B"],
         by_g: Bool[Array, "m B"],
-    ) -> Int[Array, "m B"]:
-        """Phases after events where forces may vanish before the indentation."""
+    ) -> tuple[Int[Array, "m B"], Contacts]:
+        """Phases and rows after events of forces that may end before the indentation.
+
+        COMPRESSION ends SLACK where the force ends, SLACK in COMPRESSION where it sets
+        in; both end OPEN at x = 0, where OPEN closes to COMPRESSION.
+        """
+        x, g, p = rows
+        is_open = phase == Phase.OPEN
+        opened = by_g & ~is_open
+        closed = by_x & is_open
+        free = (phase == Phase.SLACK) | is_open
         after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
-        free = (phase == Phase.SLACK) | (phase == Phase.OPEN)
         after = jnp.where(by_x & free, Phase.COMPRESSION, after)
-        return jnp.where(by_g & ~(phase == Phase.OPEN), Phase.OPEN, after)
+        after = jnp.where(opened, Phase.OPEN, after)
+        x = jnp.where(opened | closed, 0.0, x)
+        return after, Contacts(x, g, p)
 
     def begins(
         self, before: Int[Array, "modes B"], after: Int[Array, "modes B"]
     ) -> Bool[Array, "1 B"]:
         """Mask: a contact has closed behind a gap, from where on x grows like t.
 
-        Without gaps x sets in like t^2, and forces are smooth enough.
+        False without gaps: there x sets in like t^2, and forces are smooth enough.
         """
-        m = self.contacts
         if not self.gapped:
             return jnp.zeros((1, *before.shape[1:]), bool)
-        return any_of(after[m : 2 * m] > before[m : 2 * m])
+        return any_of(self.modes(after).closings > self.modes(before).closings)
 
     def coasts(self, modes: Int[Array, "modes B"]) -> Bool[Array, "1 B"] | None:
-        """Mask: there are gaps, and no contact is loaded."""
+        """Mask: no contact is loaded; None without gaps."""
         if not self.gapped:
             return None
-        phase = modes[: self.contacts]
+        phase = self.modes(modes).phase
         return ~any_of((phase != Phase.OPEN) & (phase != Phase.SLACK))
 
     # ---- results
@@ -680,14 +792,21 @@ class ContactFlow(Flow):
         const = self.normal_constants(modes)
         none = y[:0]
         x, g, p = self.rows(y)
-        force = self.force(const, x, g)
         return ContactStates(
-            force, x, p, const.scale * g, none, none, none, none, const.unit
+            force=self.force(const, x, g),
+            indentation=x,
+            impulse=p,
+            gap_velocity=const.scale * g,
+            tangential_force=none,
+            tangential_impulse=none,
+            slip=none,
+            tangential_energy=none,
+            rate=const.unit,
         )
 
     def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
         """Change `G p` of the gap velocities by the impulses of a state."""
-        return self.coupling.times(self.rows(y)[2])
+        return self.coupling.times(self.rows(y).p)
 
     # ---- the end
 
@@ -714,18 +833,15 @@ class ContactFlow(Flow):
         """True if the chain is so long that a look ahead decides whether it comes to
         rest.
         """
-        return (
-            isinstance(self.coupling, Chain)
-            and self.contacts > MANY
-            and self.self_similar
-        )
+        long_chain = isinstance(self.coupling, Chain) and self.contacts > MANY
+        return long_chain and self.self_similar
 
     def look_due(self, passes: Float[Array, "1 B"]) -> Bool[Array, "1 B"]:
         """Mask: passes per contact are LOOKS times 1, 2, 4, ..., and energy is lost."""
-        each = LOOKS * self.contacts
-        whole = passes.astype(jnp.int32)
-        number = jax.lax.div(whole, jnp.full_like(whole, each))
-        due = (whole == number * each) & (number > 0) & (number & (number - 1) == 0)
+        interval = LOOKS * self.contacts
+        passes = passes.astype(jnp.int32)
+        number = jax.lax.div(passes, jnp.full_like(passes, interval))
+        due = (passes == number * interval) & is_power_of_two(number)
         return due & any_of(self.restitution < 1)
 
     def pauses(
@@ -734,27 +850,24 @@ class ContactFlow(Flow):
         after: Int[Array, "modes B"],
         passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"] | None:
-        """Mask: the most closings of a contact become 8, 16, 32, ...: see
-        `plastic_limit.py`.
+        """Mask: the most closings of a contact become 8, 16, 32, ... after DRAGGING
+        passes per contact, or a look ahead is due; None where no state returns as a
+        multiple of itself. See `plastic_limit.py`.
         """
         if not self.self_similar:
             return None
-        m = self.contacts
-        count, old = (
-            jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before)
-        )
-        doubled = (count > old) & (count >= OFTEN) & (count & (count - 1) == 0)
-        doubled = doubled & (passes > DRAGGING * m)
+        count = largest_of(self.modes(after).closings)
+        old = largest_of(self.modes(before).closings)
+        doubled = (count > old) & (count >= OFTEN) & is_power_of_two(count)
+        doubled = doubled & (passes > DRAGGING * self.contacts)
         if self.looks_ahead:
             return doubled | self.look_due(passes)
         return doubled
 
     def patience(self, passes: Float[Array, "1 B"]) -> Float[Array, "1 B"]:
         """The tolerance, WIDENED once an impact drags on."""
-        return (
-            jnp.where(passes > PATIENCE * self.taking_part, WIDENED, 1.0)
-            * self.tolerance
-        )
+        late = passes > PATIENCE * self.taking_part
+        return jnp.where(late, WIDENED, 1.0) * self.tolerance
 
     def energy(
         self, x: Float[Array, "m B"], g: Float[Array, "m B"]
@@ -772,16 +885,15 @@ class ContactFlow(Flow):
         end, alone.
 
         At work: loaded or approaching, with `x^(eta + 1) + g^2 > tolerance^2`; alone it
-        ends with e times the root of that.
+        ends with e times the root of that, others with their gamma. With a viscous
+        force: approaching, or loaded at x > 0, with x or |g| above the tolerance.
         """
         x, g, _ = self.rows(y)
-        phase = modes[: self.contacts]
         gamma = self.scales(modes) * g
         energy = self.energy(x, g)
         works = ((x > 0) | (gamma < 0)) & (energy > tolerance**2)
         if self.viscous is not None:
-            loaded = (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
-            works = loaded & (x > 0) | (gamma < 0)
+            works = self.loaded(modes) & (x > 0) | (gamma < 0)
             works = works & ((x > tolerance) | (jnp.abs(g) > tolerance))
         rebound = self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))
         return works, gamma, jnp.where(works, rebound, gamma)
@@ -792,8 +904,8 @@ class ContactFlow(Flow):
         y: Float[Array, "n B"],
         passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"]:
-        """Mask: loaded contacts act on no others, so that the rest follows from their
-        energies.
+        """Mask: no contact is at work; or, with a closed form, those at work act on no
+        others at work, and the rest follows from their energies.
 
         With changes d of gamma in contacts that end alone, others keep
         `gamma + min(G, 0) d >= 0`.
@@ -802,14 +914,20 @@ class ContactFlow(Flow):
         works, gamma, rebound = self.at_work(modes, y, tolerance)
         if not self.closed_form:
             return ~any_of(works)
-        # |G| and min(G, 0), both with a unit diagonal: less the contact itself
-        load = works.astype(y.dtype)
-        # to another one at work
-        coupled = self.coupling.magnitude().times(load) - load > 0
-        change = rebound - gamma
-        # gamma+ of the others
-        least = gamma + self.coupling.pull().times(change) - change
-        return ~any_of(jnp.where(works, coupled, least < -tolerance))
+        # over the others, i != j: sum |G_ji|, i at work; gamma_j + sum min(G_ji, 0) d_i
+        at_work = works.astype(y.dtype)
+        coupled = self.coupling.magnitude().times(at_work) - at_work > 0
+        d = rebound - gamma
+        lowest = gamma + self.coupling.pull().times(d) - d
+        goes_on = jnp.where(works, coupled, lowest < -tolerance)
+        return ~any_of(goes_on)
+
+    def finished(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "n B"]:
+        """The state of `finish` alone."""
+        _, y = self.finish(modes, y)
+        return y
 
     def finish(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
@@ -817,12 +935,11 @@ class ContactFlow(Flow):
         """All contacts open; where a closed form ends the impact, its impulses are
         added.
         """
-        m = self.contacts
         x, _, p = self.rows(y)
         _, gamma, rebound = self.at_work(modes, y, self.tolerance)
         if not self.closed_form:
             rebound = gamma
-        phase = jnp.full_like(modes[:m], Phase.OPEN)
-        return jnp.concatenate([phase, modes[m:]]), jnp.concatenate(
-            [jnp.zeros_like(x), rebound, p + rebound - gamma, y[3 * m :]]
-        )
+        phase, closings, slip = self.modes(modes)
+        modes = Modes(jnp.full_like(phase, Phase.OPEN), closings, slip).packed()
+        rows = Contacts(jnp.zeros_like(x), rebound, p + rebound - gamma)
+        return modes, self.with_rows(y, rows)

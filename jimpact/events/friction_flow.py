@@ -29,10 +29,13 @@ from jimpact.events.contact_flow import (
     DRAGGING,
     SNAP,
     ContactFlow,
+    Contacts,
     ContactStates,
     Frozen,
+    Modes,
     Phase,
     as_pytree,
+    largest_of,
     plus_one,
     power,
 )
@@ -46,6 +49,7 @@ from jimpact.numerics.dense import (
 from jimpact.numerics.friction import distribute
 from jimpact.numerics.stepper import any_of
 from jimpact.tools.loops import fori_loop
+from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
 
 # part of the unit of time. At the first touch forces are 0 and cannot decide which
@@ -75,7 +79,7 @@ class FrictionConstants(NamedTuple):
     """Factors of the field that do not change while the modes last."""
 
     frozen: Frozen
-    stick: Bool[Array, "m B"]  # (m, B)
+    stick: Bool[Array, "m B"]
     drag: Float[Array, "m B"]  # lambda / F of those that slide
     pull: Float[Array, "m m B"]  # u' = pull F without sticking forces
     tangent: Float[Array, "m m B"]  # K_tt of those that stick
@@ -110,7 +114,32 @@ class Cycle(NamedTuple):
         """The cycle before the first state is kept."""
         zero = jnp.zeros_like(gamma)
         no = jnp.zeros(gamma.shape, bool)
-        return cls(modes, zero[:1], zero, zero, zero, zero, zero, no, no)
+        return cls(
+            modes=modes,
+            passes=zero[:1],
+            gamma=zero,
+            root=zero,
+            slip=zero,
+            impulse=zero,
+            side=zero,
+            wedged=no,
+            stops=no,
+        )
+
+
+class FrictionRows(NamedTuple):
+    """Rows of a state with friction."""
+
+    x: Float[Array, "m B"]  # indentations
+    g: Float[Array, "m B"]  # gamma / s
+    p: Float[Array, "m B"]  # normal impulses
+    u: Float[Array, "t B"]  # slip
+    side: Float[Array, "t B"]  # tangential impulses
+    time: Float[Array, "1 B"]
+
+    def packed(self) -> Float[Array, "n B"]:
+        """The rows as one array."""
+        return jnp.concatenate(self)
 
 
 @as_pytree
@@ -125,35 +154,65 @@ class FrictionFlow(ContactFlow):
     # ---- the state: x, g, p, slip u, its impulse, time
 
     @property
+    def tangents(self) -> int:
+        """Number t of tangential rows."""
+        return self.normal_tangent.shape[1]
+
+    @property
     def driving(self) -> tuple[int, ...]:
         """Sizes of the blocks x, g, p and slip."""
         m = self.contacts
-        return m, m, m, self.normal_tangent.shape[1]
+        return m, m, m, self.tangents
 
     @property
     def adding(self) -> tuple[int, ...]:
         """Sizes of the blocks of the tangential impulse and of time."""
-        return self.normal_tangent.shape[1], 1
+        return self.tangents, 1
+
+    def slip_rows(self, y: Float[Array, "driving B"]) -> Float[Array, "t B"]:
+        """The rows of slip of a state."""
+        m = self.contacts
+        return y[3 * m : 3 * m + self.tangents]
 
     def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
         """Slip u of a state."""
-        m = self.contacts
-        return y[3 * m : 4 * m]
+        return self.slip_rows(y)
 
     def side_impulse(self, y: Float[Array, "n B"]) -> Float[Array, "t B"]:
         """Tangential impulse of a state, its last rows but the time."""
-        t = self.normal_tangent.shape[1]
-        return y[-1 - t : -1]
+        return y[-1 - self.tangents : -1]
+
+    def with_tangents(
+        self, y: Float[Array, "n B"], u: Float[Array, "t B"]
+    ) -> Float[Array, "n B"]:
+        """A state without friction, with slip u and no tangential impulse before the
+        time.
+        """
+        x, g, p = self.rows(y)
+        return FrictionRows(x, g, p, u, jnp.zeros_like(u), time=y[-1:]).packed()
+
+    def friction_rows(self, y: Float[Array, "n B"]) -> FrictionRows:
+        """All rows of a state."""
+        x, g, p = self.rows(y)
+        u = self.slip_rows(y)
+        side = self.side_impulse(y)
+        return FrictionRows(x, g, p, u, side, time=y[-1:])
+
+    def with_slip_modes(
+        self, modes: Int[Array, "modes B"], slip: Int[Array, "m B"]
+    ) -> Int[Array, "modes B"]:
+        """The modes with these modes of slip."""
+        phase, closings, _ = self.modes(modes)
+        return Modes(phase, closings, slip.astype(modes.dtype)).packed()
 
     def start_with(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state before the impact, from gamma, indentations x and slip u."""
-        m = self.contacts
         modes, y = self.start(gamma, x)
-        modes = jnp.concatenate([modes, jnp.sign(u).astype(jnp.int32)])
-        y = jnp.concatenate([y[: 3 * m], u, jnp.zeros_like(u), y[3 * m :]])
-        closed = modes[:m] != Phase.OPEN
+        modes = self.with_slip_modes(modes, jnp.sign(u))
+        y = self.with_tangents(y, u)
+        closed = self.modes(modes).phase != Phase.OPEN
         return self.decided(modes, y, jnp.zeros_like(closed), closed)
 
     # ---- the protocol
@@ -161,27 +220,21 @@ class FrictionFlow(ContactFlow):
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "n #B"] | float:
-        """Allowed error of each row, in tolerances: more of p_t, rounding / weight
-        (`ridge`).
+        """Allowed error of each row, in tolerances: `max(ridge / tolerance, 1)` of the
+        tangential impulse, 1 of others.
 
         The sharing of tangential forces is no more accurate. It changes no velocity,
         and all else of lambda is linear in F while the modes last.
         """
-        m = self.contacts
-        shares = (np.arange(len(y)) // m == 4)[:, None]
-        return jnp.where(shares, jnp.maximum(ridge(y.dtype) / self.tolerance, 1.0), 1.0)
-
-    def loaded(self, modes: Int[Array, "modes B"]) -> Bool[Array, "m B"]:
-        """Mask of the contacts in compression or expansion."""
-        phase = modes[: self.contacts]
-        return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
+        coarse = jnp.maximum(ridge(y.dtype) / self.tolerance, 1.0)
+        ones = self.friction_rows(jnp.ones_like(y))
+        return ones._replace(side=coarse * ones.side).packed()
 
     def constants(self, modes: Int[Array, "modes B"]) -> Any:
         """Factors of the normal field and of friction: who sticks, lambda / F of the
         others.
         """
-        m = self.contacts
-        slip = modes[2 * m :]
+        slip = self.modes(modes).slip
         stick = (slip == 0) & self.loaded(modes)
         drag = -slip.astype(self.friction.dtype) * self.friction
         k = jnp.where(stick[:, None] & stick[None], self.tangent, 0.0)
@@ -201,12 +254,11 @@ class FrictionFlow(ContactFlow):
         Each contact has units of its own (`dimensionless`), in which the rows of K_tt
         of such contacts are multiples of each other.
         """
-        rows = np.arange(self.contacts)
-        own = self.tangent[rows, rows]
-        movable = own > 0
-        return ridge(own.dtype) * jnp.where(
-            movable, jnp.sqrt(jnp.where(movable, own, 1.0)), 1.0
-        )
+        j = np.arange(self.contacts)
+        k = self.tangent[j, j]  # K_tt jj
+        movable = k > 0
+        root = jnp.sqrt(jnp.where(movable, k, 1.0))
+        return ridge(k.dtype) * jnp.where(movable, root, 1.0)
 
     def forces(
         self, const: FrictionConstants, y: Float[Array, "driving B"]
@@ -214,23 +266,24 @@ class FrictionFlow(ContactFlow):
         """Forces F and lambda in a state, rates u' of slip, and margins of sticking.
 
         Sliding: `lambda = drag F`; sticking: `K_tt lambda = -pull F` for them, shared
-        in proportion to mu F where K_tt is singular.
+        in proportion to mu F where K_tt is singular. With h = |lambda| / (weight mu F)
+        of one that sticks, and h_1 = max mu F, `room = (h_1 - h) / (h_1 + h)`; 1 of
+        others and where both are 0.
         """
         x, g, _ = self.rows(y)
         f = self.force(const.frozen, x, g)
-        most = self.friction * f
+        cone = self.friction * f
         pull = times(const.pull, f)
-        largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
-        weight = load_shares(most)
+        largest = jax.lax.stop_gradient(largest_of(cone))
+        weight = load_shares(cone)
         right = jnp.where(const.stick, -pull, 0.0)
         held = regularized_once(const.tangent * weight[None], const.ridge, right)
         hold = weight * held
         size = jnp.abs(held)
         # in parts of the force: those of a contact that opens vanish together
-        some = const.stick & (largest + size > 0)
-        room = jnp.where(
-            some, (largest - size) / jnp.where(some, largest + size, 1.0), 1.0
-        )
+        together = largest + size
+        some = const.stick & (together > 0)
+        room = quotient(largest - size, together, where=some, otherwise=1.0)
         rate = jnp.where(const.stick, 0.0, pull + times(self.tangent, hold))
         return FrictionForces(f, const.drag * f + hold, rate, room)
 
@@ -242,35 +295,32 @@ class FrictionFlow(ContactFlow):
         """
         frozen = const.frozen
         forces = self.forces(const, y)
-        pull = self.coupling.times(forces.normal) + times(
-            self.normal_tangent, forces.side
+        across = times(self.normal_tangent, forces.side)
+        pull = self.coupling.times(forces.normal) + across
+        rates = FrictionRows(
+            x=frozen.closing * self.rows(y).g,
+            g=frozen.ratio * pull,
+            p=frozen.unit * forces.normal,
+            u=frozen.unit * forces.rate,
+            side=frozen.unit * forces.side,
+            time=frozen.unit,
         )
-        return jnp.concatenate(
-            [
-                frozen.closing * self.rows(y)[1],
-                frozen.ratio * pull,
-                frozen.unit * forces.normal,
-                frozen.unit * forces.rate,
-                frozen.unit * forces.side,
-                frozen.unit,
-            ]
-        )
+        return rates.packed()
 
     def margins(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "k B"]:
         """Margins of the normal flow, speeds of slip, distances to the friction cones
         (m each).
+
+        The speed is 1 of a contact that does not slide.
         """
-        m = self.contacts
-        slides = (modes[2 * m :] != 0) & self.loaded(modes)
-        return jnp.concatenate(
-            [
-                self.normal_margins(const.frozen, modes, y),
-                jnp.where(slides, modes[2 * m :].astype(y.dtype) * self.slip(y), 1.0),
-                self.forces(const, y).room,
-            ]
-        )
+        sign = self.modes(modes).slip
+        slides = (sign != 0) & self.loaded(modes)
+        speed = sign.astype(y.dtype) * self.slip(y)
+        speed = jnp.where(slides, speed, 1.0)
+        normal = self.normal_margins(const.frozen, modes, y)
+        return jnp.concatenate([normal, speed, self.forces(const, y).room])
 
     def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "k B"]:
         """Mask of the openings, as in the normal flow; margins of friction have no
@@ -287,16 +337,18 @@ class FrictionFlow(ContactFlow):
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state after events: slip that stops and stick that breaks
         included.
+
+        A contact that breaks loose slides against the force that held it.
         """
-        m = self.contacts
-        stopped = which[2 * m : 3 * m]
-        broke = which[3 * m :]
+        _, _, stopped, broke = self.kinds(which)
+        before = self.modes(modes)
         side = self.forces(self.constants(modes), y).side
-        turned = jnp.where(broke, -jnp.sign(side).astype(modes.dtype), modes[2 * m :])
-        after, y = self.normal_switch(modes, y, which[: 2 * m])
-        after = jnp.concatenate([after[: 2 * m], turned])
-        closed = after[m : 2 * m] > modes[m : 2 * m]
-        return self.decided(after, y, stopped, closed)
+        direction = -jnp.sign(side).astype(modes.dtype)  # against the force of sticking
+        slip = jnp.where(broke, direction, before.slip)
+        modes, y = self.normal_switch(modes, y, which)
+        modes = self.with_slip_modes(modes, slip)
+        closed = self.modes(modes).closings > before.closings
+        return self.decided(modes, y, stopped, closed)
 
     def decided(
         self,
@@ -308,96 +360,94 @@ class FrictionFlow(ContactFlow):
         """Modes and state once it is decided which contacts stick, and where others
         slide to.
 
-        `distribute` decides anew where slip has `stopped`, or a contact has `closed`
-        without slip, from the forces of a moment later.
+        A contact that has `closed` with slip slides along it. `distribute` decides anew
+        where slip has `stopped`, or a contact has `closed` without slip, from the
+        forces of a moment later: of these contacts, of those that stick, and of those
+        at rest.
         """
-        m = self.contacts
         u = self.slip(y)
-        slip = modes[2 * m :]
+        slip = self.modes(modes).slip
         loaded = self.loaded(modes)
         rests = jnp.abs(u) <= SNAP * self.tolerance
-        slip = jnp.where(closed & ~rests, jnp.sign(u).astype(slip.dtype), slip)
+        sign = jnp.sign(u).astype(slip.dtype)
+        slip = jnp.where(closed & ~rests, sign, slip)
         resting = loaded & rests & ((slip != 0) | closed)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | (slip == 0))
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
-        most = constant.friction * f
+        cone = constant.friction * f  # mu F
         # b = u' by normal forces and by the friction of contacts that slide on
-        slides = jnp.where(to_check | ~loaded, 0.0, -slip.astype(u.dtype) * most)
-        b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f) + times(
-            constant.tangent, slides
-        )
-        stick, towards = distribute(constant.tangent, b, most, to_check)
+        sliding = -slip.astype(u.dtype) * cone
+        sliding = jnp.where(to_check | ~loaded, 0.0, sliding)
+        tangent_normal = jnp.swapaxes(constant.normal_tangent, 0, 1)
+        b = times(tangent_normal, f) + times(constant.tangent, sliding)
+        stick, towards = distribute(constant.tangent, b, cone, to_check)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(to_check, towards, slip)
-        y = self._at_rest(modes, y, to_check, jnp.where(stick, most, 0.0))
-        return jnp.concatenate([modes[: 2 * m], slip]), y
+        y = self._at_rest(modes, y, to_check, jnp.where(stick, cone, 0.0))
+        return self.with_slip_modes(modes, slip), y
 
     def _at_rest(
         self,
         modes: Int[Array, "modes B"],
         y: Float[Array, "n B"],
         rests: Bool[Array, "m B"],
-        most: Float[Array, "m B"],
+        cone: Float[Array, "m B"],
     ) -> Float[Array, "n B"]:
-        """The state with slips of 0 at contacts that rest; those with `most` = mu F > 0
+        """The state with slips of 0 at contacts that rest; those with `cone` = mu F > 0
         stick.
 
-        Slips are nothing there, but their tangents are not: those of a contact that
-        sticks are taken by a tangential impulse, of one that begins to slide they
-        remain.
+        Slips are nothing there, but their tangents are not. Those of contacts that
+        stick are taken by a tangential impulse q, `u + K_tt q = 0`, shared in
+        proportion to mu F where K_tt is singular: `q = w y`, w the shares of mu F,
+        `(K_tt w + ridge) y = -u`. Of one that begins to slide they remain.
         """
-        m = self.contacts
-        x, g, p = self.rows(y)
-        u = self.slip(y)
-        weight = load_shares(most)
-        holds = most > 0
-        soft = jnp.where(holds, ridge(u.dtype), 1.0)
-        right = jnp.where(holds, -u, 0.0)
-        side = weight * regularized_once(self.tangent * weight[None], soft, right)
-        g = g + self.as_rows(modes, times(self.normal_tangent, side))
-        u = u + times(self.tangent, side)
+        rows = self.friction_rows(y)
+        u = rows.u
+        w = load_shares(cone)
+        sticks = cone > 0
+        soft = jnp.where(sticks, ridge(u.dtype), 1.0)
+        right = jnp.where(sticks, -u, 0.0)
+        q = w * regularized_once(self.tangent * w[None], soft, right)
+        dg = self.as_rows(modes, times(self.normal_tangent, q))
+        u = u + times(self.tangent, q)
         u = jnp.where(rests, u - jax.lax.stop_gradient(u), u)
-        return jnp.concatenate([x, g, p, u, y[4 * m : 5 * m] + side, y[5 * m :]])
+        rows = rows._replace(g=rows.g + dg, u=u, side=rows.side + q)
+        return rows.packed()
 
     def as_rows(
         self, modes: Int[Array, "modes B"], gamma: Float[Array, "m B"]
     ) -> Float[Array, "m B"]:
         """Changes of the rows g = gamma / s from those of gamma; 0 where s = e = 0."""
-        scale = self.scales(modes)
-        return jnp.where(scale > 0, gamma / jnp.where(scale > 0, scale, 1.0), 0.0)
+        s = self.scales(modes)
+        return quotient(gamma, s, where=s > 0)
 
     def soon(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "m B"]:
-        """Normal forces a MOMENT later, in parts of the largest."""
+        """Normal forces at x a MOMENT later, in parts of the largest; 0 if all are."""
         const = self.normal_constants(modes)
         x, g, _ = self.rows(y)
-        f = self.force(const, jnp.maximum(x + MOMENT * const.closing * g, 0.0), g)
-        top = jnp.max(f, axis=0, keepdims=True)
-        return f / jnp.where(top > 0, top, 1.0)
+        x = jnp.maximum(x + MOMENT * const.closing * g, 0.0)
+        f = self.force(const, x, g)
+        largest = largest_of(f)
+        return f / jnp.where(largest > 0, largest, 1.0)
 
     def contact_states(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> ContactStates:
         """Forces, velocities and slip in a state."""
-        m = self.contacts
-        side = self.forces(self.constants(modes), y).side
-        return (
-            super()
-            .contact_states(modes, y)
-            ._replace(
-                tangential_force=side,
-                tangential_impulse=y[4 * m : 5 * m],
-                slip=self.slip(y),
-            )
+        states = super().contact_states(modes, y)
+        return states._replace(
+            tangential_force=self.forces(self.constants(modes), y).side,
+            tangential_impulse=self.side_impulse(y),
+            slip=self.slip(y),
         )
 
     def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
         """Change `G p + K_nt p_t` of the gap velocities by the impulses of a state."""
-        side = y[-1 - self.normal_tangent.shape[1] : -1]
-        return super().change(y) + times(self.normal_tangent, side)
+        return super().change(y) + times(self.normal_tangent, self.side_impulse(y))
 
     # ---- the end
 
@@ -406,7 +456,7 @@ class FrictionFlow(ContactFlow):
         """True if rigid contacts in the plane: a state multiplied by s then takes the
         same course, see `wedged_limit.py`.
         """
-        planar = self.normal_tangent.shape[1] == self.contacts
+        planar = self.tangents == self.contacts
         return planar and not self.gapped and self.viscous is None
 
     @property
@@ -431,7 +481,9 @@ class FrictionFlow(ContactFlow):
         after: Int[Array, "modes B"],
         passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"] | None:
-        """Mask: after an event, where the impact drags on."""
+        """Mask: after an event, where the impact drags on; None where no contacts can
+        be wedged.
+        """
         if not self.wedges:
             return None
         return any_of(before != after) & (passes > DRAGGING * self.taking_part)
@@ -439,7 +491,7 @@ class FrictionFlow(ContactFlow):
     @property
     def at_once(self) -> bool:
         """True if there is one contact, and it is planar."""
-        return super().at_once and self.normal_tangent.shape[1] == 1
+        return super().at_once and self.tangents == 1
 
     def over(
         self,
@@ -454,13 +506,13 @@ class FrictionFlow(ContactFlow):
     def finish(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state with indentations of 0, after the impulses of a single
-        contact.
+        """Modes and state with indentations of 0; of a single contact in the plane,
+        without gaps, after its impulses in closed form.
         """
         if self.at_once:
             return modes, self._after_one(modes, y)
-        m = self.contacts
-        return modes, jnp.concatenate([jnp.zeros_like(y[:m]), y[m:]])
+        x, g, p = self.rows(y)
+        return modes, self.with_rows(y, Contacts(jnp.zeros_like(x), g, p))
 
     def settled(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], cycle: Cycle
@@ -473,38 +525,46 @@ class FrictionFlow(ContactFlow):
         are next to those of the series.
         """
         m = self.contacts
-        _, g, p = self.rows(y)
-        u = self.slip(y)
-        gamma = self.scales(modes) * g
-        across = self.normal_tangent
-        back = jnp.swapaxes(across, 0, 1)
-        coupling = self.coupling.dense(m)
-        eye = unit(self.tangent)
-        drag = -self.friction * jnp.sign(jax.lax.stop_gradient(u))
-        # rows of P, then of Q; those of a contact that slides, or is not wedged: of Q -
-        # r P
+        rows = self.friction_rows(y)
+        u = rows.u
+        gamma = self.scales(modes) * rows.g
+        g_nn = self.coupling.dense(m)
+        k_nt = self.normal_tangent
+        k_tn = jnp.swapaxes(k_nt, 0, 1)
+        k_tt = self.tangent
+        eye = unit(k_tt)
+        drag = -self.friction * jnp.sign(jax.lax.stop_gradient(u))  # Q = drag P
         wedged = cycle.wedged[:, None]
         stops = cycle.stops[:, None]
-        rubs = jnp.where(wedged, -eye * drag[:, None], 0.0)
-        normal = [jnp.where(wedged, coupling, eye), jnp.where(wedged, across, 0.0)]
-        side = [jnp.where(stops, back, rubs), jnp.where(stops, self.tangent, eye)]
-        rows = [jnp.concatenate(z, axis=1) for z in (normal, side)]
-        matrix = jnp.concatenate(rows)
-        right = [
-            jnp.where(cycle.wedged, -gamma, 0.0),
-            jnp.where(cycle.stops, -u, 0.0),
-        ]
-        left = jnp.concatenate([cycle.impulse, cycle.side])
-        error = jnp.concatenate(right) - times(matrix, left)
-        soft = jnp.full_like(left, ridge(u.dtype))
-        left = left + regularized(matrix, error, soft, 1, without_null=True)
-        dp = left[:m]
-        dq = left[m:]
-        g = g + self.as_rows(modes, times(coupling, dp) + times(across, dq))
-        u = u + times(back, dp) + times(self.tangent, dq)
-        none = jnp.zeros_like(g)
-        total_side = self.side_impulse(y) + dq
-        return jnp.concatenate([none, g, p + dp, u, total_side, y[5 * m :]])
+        slides = jnp.where(wedged, -eye * drag[:, None], 0.0)
+        # rows of gamma = 0, else of P = 0
+        of_p = jnp.where(wedged, g_nn, eye)
+        of_q = jnp.where(wedged, k_nt, 0.0)
+        normal_rows = jnp.concatenate([of_p, of_q], axis=1)
+        # rows of u = 0, else of Q - drag P = 0, or Q = 0
+        of_p = jnp.where(stops, k_tn, slides)
+        of_q = jnp.where(stops, k_tt, eye)
+        tangential_rows = jnp.concatenate([of_p, of_q], axis=1)
+        matrix = jnp.concatenate([normal_rows, tangential_rows])
+        right_p = jnp.where(cycle.wedged, -gamma, 0.0)
+        right_q = jnp.where(cycle.stops, -u, 0.0)
+        impulses = jnp.concatenate([cycle.impulse, cycle.side])  # those of the series
+        error = jnp.concatenate([right_p, right_q]) - times(matrix, impulses)
+        soft = jnp.full_like(impulses, ridge(u.dtype))
+        nearest = regularized(matrix, error, soft, 1, without_null=True)
+        impulses = impulses + nearest
+        dp = impulses[:m]
+        dq = impulses[m:]
+        dg = self.as_rows(modes, times(g_nn, dp) + times(k_nt, dq))
+        rows = FrictionRows(
+            x=jnp.zeros_like(rows.x),
+            g=rows.g + dg,
+            p=rows.p + dp,
+            u=u + times(k_tn, dp) + times(k_tt, dq),
+            side=rows.side + dq,
+            time=rows.time,
+        )
+        return rows.packed()
 
     def _after_one(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
@@ -512,46 +572,53 @@ class FrictionFlow(ContactFlow):
         """The state after the impact of a single contact, in closed form.
 
         With its normal impulse p gamma grows at the rate `1 + K_nt r`, u at
-        `K_nt + K_tt r`, where r = lambda / F: `drag` until slip stops, from then on
-        `hold`, -K_nt / K_tt within the cone.
+        `K_nt + K_tt r`, where r = lambda / F: `drag` = -mu sign(u) until slip stops,
+        from then on `hold`, -K_nt / K_tt, or +-mu where that is beyond the cone: slip
+        then begins anew, to the other side. A contact that is not at work stays as it
+        is, but for x = 0.
         """
         works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
-        x, _, p = self.rows(y)
-        u = self.slip(y)
-        slip = modes[2:]
-        # K_nt, K_tt, mu
-        across = self.normal_tangent[0]
-        own = self.tangent[0]
+        rows = self.friction_rows(y)
+        x = rows.x
+        u = rows.u
+        sign = self.modes(modes).slip
+        k_nt = self.normal_tangent[0]
+        k_tt = self.tangent[0]
         mu = self.friction
-        drag = -slip.astype(u.dtype) * mu
-        movable = own > 0
-        hold = jnp.where(movable, -across / jnp.where(movable, own, 1.0), 0.0)
-        # or slip begins anew, to the other side
+        drag = -sign.astype(u.dtype) * mu
+        hold = quotient(-k_nt, k_tt, where=k_tt > 0)
         hold = jnp.sign(hold) * jnp.minimum(jnp.abs(hold), mu)
-        rate = across + own * drag
-        stops = (slip != 0) & (u * rate < 0)
-        length = jnp.where(stops, -u / jnp.where(stops, rate, 1.0), jnp.inf)
-        length = jnp.where(slip == 0, 0.0, length)
-        twice = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
-        slopes = 1 + across * drag, 1 + across * hold
+        du = k_nt + k_tt * drag  # over dp, while it slides
+        stops = (sign != 0) & (u * du < 0)
+        length = quotient(-u, du, where=stops, otherwise=jnp.inf)
+        length = jnp.where(sign == 0, 0.0, length)
+        energy = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
         start = SingleContact(
-            jnp.where(works, gamma, -1.0), twice, length, 0 * p, 0 * p
+            gap_velocity=jnp.where(works, gamma, -1.0),
+            energy=energy,
+            left=length,
+            sliding=0 * rows.p,
+            holding=0 * rows.p,
         )
-        end = fori_loop(
-            0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start
-        )
+        slopes = 1 + k_nt * drag, 1 + k_nt * hold
+
+        def next_piece(_: Any, s: SingleContact) -> SingleContact:
+            """The contact after one more piece."""
+            return _next_piece(s, slopes, self.restitution)
+
+        end = fori_loop(0, PIECES, next_piece, start)
         side = drag * end.sliding + hold * end.holding
         side = jnp.where(works, side, 0.0)
         dp = jnp.where(works, end.sliding + end.holding, 0.0)
-        gamma = jnp.where(works, end.gap_velocity, gamma)
-        rows = [
-            jnp.zeros_like(x),
-            gamma,
-            p + dp,
-            u + across * dp + own * side,
-            y[4:5] + side,
-        ]
-        return jnp.concatenate([*rows, y[5:]])
+        rows = FrictionRows(
+            x=jnp.zeros_like(x),
+            g=jnp.where(works, end.gap_velocity, gamma),
+            p=rows.p + dp,
+            u=u + k_nt * dp + k_tt * side,
+            side=rows.side + side,
+            time=rows.time,
+        )
+        return rows.packed()
 
 
 class SingleContact(NamedTuple):
@@ -574,44 +641,54 @@ def _next_piece(
     """The contact after its slip stops, it turns, or is unloaded; as it is where it is
     unloaded.
 
-    gamma grows with the impulse at the rates `slopes`, until slip stops and from then
-    on. While it is compressed, energy grows as -gamma^2 / slope; while it expands, it
-    falls e^-2 times as fast.
+    gamma grows with the impulse p at the rates `slopes`, until slip stops and from then
+    on; twice the energy changes by `dE = -2 gamma dp` in compression, and by
+    `-2 gamma dp / e^2` in expansion. A piece ends where
+
+        slip stops      p = left
+        gamma turns     p = -gamma / slope, in compression, or in an expansion whose
+                        gamma falls to 0 before the energy does
+        it is unloaded  gamma+ = sqrt(gamma^2 + e^2 slope E),
+                        p = e^2 E / (gamma + gamma+)
+
+    whichever is first. From gamma = 0 the last one is `gamma+ = e sqrt(slope E)`,
+    `p = e sqrt(E / slope)`, regular at e = 0.
     """
     gamma = s.gap_velocity
     energy = s.energy
     slides = s.left > 0
     slope = jnp.where(slides, *slopes)
-    most = jnp.where(slides, s.left, jnp.inf)
+    until_stop = jnp.where(slides, s.left, jnp.inf)
     closes = (gamma < 0) | ((gamma == 0) & (slope < 0))  # is compressed
     expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
-    # gamma reaches 0, and: the expansion starts from gamma = 0
     turns = closes & (slope > 0)
-    rising = expands & (gamma == 0)
-    some = jnp.where(expands, energy, 1.0)
-    up = jnp.where(turns | rising, slope, 1.0)
-    square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * energy, 1.0)
-    back = square <= 0  # gamma falls to 0 before the energy does
-    # unloaded at gamma = end = sqrt(square), after the impulse e^2 energy / (gamma +
-    # end);
-    # from gamma = 0 the end is a multiple of e: regular at e = 0
-    end = jnp.where(
-        rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square))
-    )
-    whole = e**2 * some / jnp.where(expands & ~rising & ~back, gamma + end, 1.0)
-    whole = jnp.where(rising, e * jnp.sqrt(some / up), whole)
-    length = jnp.where(back, -gamma / jnp.where(back, slope, 1.0), whole)
-    length = jnp.where(turns, -gamma / up, jnp.where(expands, length, jnp.inf))
-    reached = length <= most
-    dp = jnp.where(closes | expands, jnp.where(reached, length, most), 0.0)
-    unloaded = expands & reached & ~back
-    after = jnp.where(
-        unloaded, end, jnp.where(reached & (turns | back), 0.0, gamma + slope * dp)
-    )
+    from_rest = expands & (gamma == 0)
+    moving = expands & ~from_rest
+    # where it is unloaded
+    stored = jnp.where(expands, energy, 1.0)
+    up = jnp.where(turns | from_rest, slope, 1.0)
+    square = jnp.where(moving, gamma**2 + e**2 * slope * energy, 1.0)
+    falls = square <= 0  # gamma turns before
+    end = jnp.sqrt(jnp.where(falls, 1.0, square))
+    end = jnp.where(from_rest, e * jnp.sqrt(up * stored), end)
+    unloading = e**2 * stored / jnp.where(moving & ~falls, gamma + end, 1.0)
+    unloading = jnp.where(from_rest, e * jnp.sqrt(stored / up), unloading)
+    # the piece
+    falling = -gamma / jnp.where(falls, slope, 1.0)
+    length = jnp.where(falls, falling, unloading)
+    length = jnp.where(expands, length, jnp.inf)
+    length = jnp.where(turns, -gamma / up, length)
+    reached = length <= until_stop
+    dp = jnp.where(reached, length, until_stop)
+    dp = jnp.where(closes | expands, dp, 0.0)
+    unloaded = expands & reached & ~falls
+    after = jnp.where(reached & (turns | falls), 0.0, gamma + slope * dp)
+    after = jnp.where(unloaded, end, after)
     share = jnp.where(expands & ~unloaded, e**2, 1.0)
+    left_energy = energy - (gamma + after) * dp / share
     return SingleContact(
         gap_velocity=after,
-        energy=jnp.where(unloaded, 0.0, energy - (gamma + after) * dp / share),
+        energy=jnp.where(unloaded, 0.0, left_energy),
         left=s.left - dp,
         sliding=s.sliding + jnp.where(slides, dp, 0.0),
         holding=s.holding + jnp.where(slides, 0.0, dp),

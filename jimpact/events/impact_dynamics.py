@@ -22,6 +22,7 @@ from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import (
     SNAP,
     Chain,
+    ContactEquations,
     ContactFlow,
     Coupling,
     Dense,
@@ -139,6 +140,7 @@ class ImpactUnits(NamedTuple):
 
 
 def dimensionless(
+    equations: ContactEquations,
     delassus: Symmetric,
     gamma: Float[Array, " m"],
     restitution: Float[Array, ""] | Float[Array, " m"],
@@ -159,8 +161,7 @@ def dimensionless(
     qn = gamma / root
     approach = jnp.where(gamma < 0, qn, 0.0)
     q = jax.lax.stop_gradient(jnp.sqrt(jnp.max(approach**2 + 2 * stored)))
-    # q^2 / k may be too small or too large for a number where x_ref is not
-    x_ref = (jnp.sqrt((eta + 1) / 2) * q / jnp.sqrt(stiffness)) ** (2 / (eta + 1))
+    x_ref = equations.depth(q, stiffness, eta)
     t_ref = x_ref / (q * root)
     time = jax.lax.stop_gradient(jnp.min(t_ref))
     # the tolerance applies to velocities: where W_jj is large, impulses must be finer
@@ -177,21 +178,26 @@ def dimensionless(
         count = jnp.sum(closed, dtype=dtype)
     count = jnp.maximum(count, 1)
     step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
+    array = None
+    if isinstance(exponent, jax.Array):
+        array = exponent * ones
+    gap = None
+    if gaps is not None:
+        gap = gaps / x_ref
     problem = Problem(
         off_diagonal=off_diagonal(g),
         omega=omega,
         restitution=restitution * ones,
-        exponent=exponent * ones if isinstance(exponent, jax.Array) else None,
+        exponent=array,
         gamma=qn / q,
         energy=2 * stored / q**2,
-        gap=None if gaps is None else gaps / x_ref,
+        gap=gap,
         tolerance=(step * closeness)[None],
         taking_part=count[None],
         step=step[None],
     )
-    return problem, ImpactUnits(
-        q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest)
-    )
+    error = jax.lax.stop_gradient(rtol * fastest)
+    return problem, ImpactUnits(q, time, root, x_ref, error)
 
 
 def tangential_of(
@@ -217,17 +223,13 @@ def normal_coupling(problem: Problem, structure: Structure) -> Float[Array, "m m
     """G with unit diagonal, from the entries above it: all, or G_j,j+1 of a chain."""
     m = problem.omega.shape[0]
     _, *batch = problem.omega.shape
-    chain = structure == "chain"
-    if chain:
+    if structure == "chain":
         i = jnp.arange(m - 1)
         j = jnp.arange(1, m)
     else:
         i, j = jnp.triu_indices(m, 1)
-    upper = (
-        jnp.zeros((m, m, *batch), problem.omega.dtype)
-        .at[i, j]
-        .set(problem.off_diagonal)
-    )
+    zero = jnp.zeros((m, m, *batch), problem.omega.dtype)
+    upper = zero.at[i, j].set(problem.off_diagonal)
     return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
 
 
@@ -244,18 +246,23 @@ def first_indentation(
     problem: Problem, exponent: Exponent | None
 ) -> Float[Array, "m *B"]:
     """Indentations before the impact: `energy^(1 / (eta + 1))` if loaded, else minus
-    the gap.
+    the gap, or 0.
     """
-    eta: Any = exponent if problem.exponent is None else problem.exponent
+    eta: Any = exponent
+    if problem.exponent is not None:
+        eta = problem.exponent
     loaded = problem.energy > 0
     energy = jnp.where(loaded, problem.energy, 1.0)
-    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
-    apart = 0.0 if problem.gap is None else -problem.gap
-    return jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
+    x = energy ** (1 / (per_row(eta, energy) + 1))
+    if problem.gap is None:
+        return jnp.where(loaded, x, 0.0)
+    # at gap 0 the derivative is the one-sided one
+    return jnp.where(loaded, x, -problem.gap)
 
 
 def flow_of(
     problem: Problem,
+    equations: ContactEquations,
     exponent: Exponent | None,
     structure: Structure,
     tighten: float = 1.0,
@@ -265,25 +272,29 @@ def flow_of(
     """
     m = problem.omega.shape[0]
     viscous = problem.viscous
+    with_slopes = tighten < 1
+    static = None
+    if problem.exponent is None:
+        static = exponent
     parts: dict[str, Any] = dict(
         coupling=coupling_of(problem, structure),
+        equations=equations,
         omega=problem.omega,
         restitution=problem.restitution,
         exponent_array=problem.exponent,
         tolerance=tighten * problem.tolerance,
         taking_part=problem.taking_part,
         viscous=viscous,
-        exponent_static=None if problem.exponent is not None else exponent,
+        exponent_static=static,
         gapped=problem.gap is not None,
         closed_form=viscous is None and problem.limit is None,
         limit=problem.limit,
-        slopes=tighten < 1,
+        slopes=with_slopes,
     )
     x = first_indentation(problem, exponent)
     if problem.tangential is None:
-        flow = ContactFlow(
-            **parts, watches=tighten < 1 and problem.exponent is not None
-        )
+        watches = with_slopes and problem.exponent is not None
+        flow = ContactFlow(**parts, watches=watches)
         return flow, *flow.start(problem.gamma, x)
     (normal_tangent, tangent, slip), friction, kappa = problem.tangential
     parts |= dict(normal_tangent=normal_tangent, tangent=tangent, friction=friction)
@@ -306,7 +317,7 @@ def undecided(problem: Problem) -> Bool[Array, "1 B"]:
     """
     gamma = problem.gamma
     if problem.viscous is None or problem.gap is None:
-        return jnp.zeros_like(gamma[:1], bool)
+        return jnp.zeros_like(problem.tolerance, bool)
     none = jnp.zeros_like(gamma)
     touches = (problem.gap <= 0) & (jnp.abs(gamma) <= SNAP * problem.tolerance)
     return any_of(touches & (problem.viscous.push(none, none) > 0))
@@ -321,12 +332,20 @@ def begins_with_a_jump(problem: Problem) -> Bool[Array, "1 B"]:
     """
     gamma = problem.gamma
     if problem.viscous is None:
-        return jnp.zeros_like(gamma[:1], bool)
+        return jnp.zeros_like(problem.tolerance, bool)
     none = jnp.zeros_like(gamma)
     jumps = problem.viscous.push(none, none) > 0
     if len(gamma) > 1:
         jumps = jumps | (problem.viscous.push(none, none - 1) > 0)
     return any_of(jumps)
+
+
+def impulses_and_time(
+    flow: ContactFlow, y: Float[Array, "n B"]
+) -> tuple[Float[Array, "m B"], Float[Array, "t B"], Float[Array, "1 B"]]:
+    """p, p_t and the time of a state."""
+    time = y[-1:]
+    return flow.rows(y).p, flow.side_impulse(y), time
 
 
 def with_slopes_unless(mask: Bool[Array, "1 B"], p: Any) -> Any:
@@ -344,9 +363,10 @@ class ImpulseProgram:
     """
 
     tree: Any
+    equations: ContactEquations
     exponent: float | tuple[float, ...] | None
     structure: Structure
-    most: int
+    max_passes: int
     tangents: int = 0  # tangential impulses
     with_end_time: bool = False
     finely: bool = False  # at the tolerance of derivatives
@@ -359,7 +379,8 @@ class ImpulseProgram:
         self, problem: Problem, tighten: float
     ) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
         """The flow of a problem, its first modes and state."""
-        flow, modes, y = flow_of(problem, self.exponent, self.structure, tighten)
+        compiled_in = self.equations, self.exponent, self.structure
+        flow, modes, y = flow_of(problem, *compiled_in, tighten)
         closed_form = flow.closed_form and not self.with_end_time
         return dataclasses.replace(flow, closed_form=closed_form), modes, y
 
@@ -371,9 +392,10 @@ class ImpulseProgram:
     def results(self, *kinds: Kind) -> tuple[Kind, ...]:
         """Kinds of the results from leaves of these kinds."""
         normal = jax.tree.unflatten(self.tree, kinds).gamma
-        one = normal._replace(shape=(1,))
-        code = Kind((1,), jnp.dtype(jnp.int32))
-        return normal, normal._replace(shape=(self.tangents,)), one, code, code
+        tangential = normal._replace(shape=(self.tangents,))
+        time = normal._replace(shape=(1,))
+        whole = Kind((1,), jnp.dtype(jnp.int32))  # status, passes
+        return normal, tangential, time, whole, whole
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
@@ -386,30 +408,36 @@ class ImpulseProgram:
             lambda problem: self.flow(problem, tighten), problem
         )
         gamma = value_of(problem.gamma)
-        rows = 3 * gamma.shape[0]
-        tangential = slice(-1 - self.tangents, -1)  # the rows before the time
         if value_of(flow).at_once:
-            state = pushforward(lambda flow, y: flow.finish(modes, y)[1], flow, y)
-            results = pushforward(
-                lambda y: (y[rows - 1 : rows], y[tangential], y[-1:]), state
-            )
+            state = pushforward(lambda flow, y: flow.finished(modes, y), flow, y)
+            results = pushforward(impulses_and_time, flow, state)
             none = jnp.full(gamma.shape, CODE["ok"], jnp.int32)
             return *results, none, none
-        end = run(flow, gamma, modes, y, self.most, inspect, self.checkpoints)
+        end = run(flow, gamma, modes, y, self.max_passes, inspect, self.checkpoints)
         state = end.carry.y
-        p = value_of(state)[rows - len(gamma) : rows] + end.impulse
+        reached, _, _ = impulses_and_time(value_of(flow), value_of(state))
+        p: Any = reached + end.impulse
         if self.finely:
-            last = flow, problem.gamma, state
             plastic = pushforward(
-                lambda f, g, y: final_impulses(f, g, y, end.carries), *last
+                lambda flow, gamma, y: final_impulses(flow, gamma, y, end.carries),
+                flow,
+                problem.gamma,
+                state,
             )
             if is_dual(plastic):
                 p = Dual(p, plastic.tangents)
             else:
                 p = plastic
         p = with_slopes_unless(undecided(value_of(problem)), p)
-        rest = pushforward(lambda y: (y[tangential], y[-1:]), state)
-        return p, *rest, end.status, end.carry.passes.astype(jnp.int32)
+        _, p_t, time = pushforward(impulses_and_time, flow, state)
+        return p, p_t, time, end.status, end.carry.passes.astype(jnp.int32)
+
+
+def with_tangents_like(x: Any, value: jax.Array) -> Any:
+    """`value` with the tangents of x, if x has some."""
+    if is_dual(x):
+        return Dual(value, x.tangents)
+    return value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -432,27 +460,33 @@ class ImplicitProgram(ImpulseProgram):
         velocity = problem.gamma
         sliding = None
         if problem.tangential is not None:
-            (across, tangent, slip), friction, _ = problem.tangential
-            back = jnp.swapaxes(across, 0, 1)
-            normal = normal_coupling(problem, self.structure)
-            rows = [
-                jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))
-            ]
-            coupling = Dense(jnp.concatenate(rows))
+            (k_nt, k_tt, slip), friction, _ = problem.tangential
+            k_tn = jnp.swapaxes(k_nt, 0, 1)
+            g_nn = normal_coupling(problem, self.structure)
+            normal_rows = jnp.concatenate([g_nn, k_nt], axis=1)
+            tangential_rows = jnp.concatenate([k_tn, k_tt], axis=1)
+            coupling = Dense(jnp.concatenate([normal_rows, tangential_rows]))
             constant = jax.lax.stop_gradient(coupling.matrix)
             sliding = descent_lengths(constant, m, friction_only=True)
             velocity = jnp.concatenate([velocity, slip])
+        tolerance = problem.tolerance
+        if self.finely:
+            tolerance = tolerance * IMPLICIT_TIGHTENING
+        static = None
+        if problem.exponent is None:
+            static = self.exponent
         flow = ImplicitSteps(
             coupling=coupling,
+            equations=self.equations,
             omega=problem.omega,
             restitution=problem.restitution,
             exponent_array=problem.exponent,
             friction=friction,
             descent=jax.lax.stop_gradient(implicit_steps.descent_of(coupling, m)),
             sliding=sliding,
-            tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
+            tolerance=tolerance,
             viscous=problem.viscous,
-            exponent_static=None if problem.exponent is not None else self.exponent,
+            exponent_static=static,
             gapped=problem.gap is not None,
         )
         return flow, flow.start(first_indentation(problem, self.exponent), velocity)
@@ -464,22 +498,20 @@ class ImplicitProgram(ImpulseProgram):
         The leaves are those of a `Problem`. Tangents that they carry pass, and
         `only_first` marks the values beside them, so that a second derivative raises;
         the reverse mode of kept checkpoints runs the steps again and needs them plain.
+        Where forces jump (`begins_with_a_jump`) tangents of the impulses are NaN.
         """
         if self.checkpoints:
             values = value_of(leaves)
         else:
             values = self.only_first(value_of(leaves))
-        first_only = [
-            Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)
-        ]
-        flow, start = pushforward(self.steps, jax.tree.unflatten(self.tree, first_only))
-        run = implicit_steps.run(flow, start, self.most, self.checkpoints)
-        m = len(value_of(start.indentation))
-        # rows of the impulse: m normal ones, then the tangential ones
+        first_only = [with_tangents_like(x, v) for x, v in zip(leaves, values)]
+        problem = jax.tree.unflatten(self.tree, first_only)
+        flow, start = pushforward(self.steps, problem)
+        run = implicit_steps.run(flow, start, self.max_passes, self.checkpoints)
         jumps = begins_with_a_jump(jax.tree.unflatten(self.tree, values))
         impulse = with_slopes_unless(jumps, run.state.impulse)
-        impulses = pushforward(lambda p: (p[:m], p[m:]), impulse)
-        return *impulses, run.state.time, self.code(flow, run), run.passes
+        p, p_t = pushforward(value_of(flow).parts, impulse)
+        return p, p_t, run.state.time, self.code(flow, run), run.passes
 
     def code(
         self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun
@@ -510,6 +542,7 @@ class Dynamics(NamedTuple):
 
     problem: Problem
     units: ImpactUnits
+    equations: ContactEquations
     exponent: Exponent
     structure: Structure
     max_steps: int
@@ -539,9 +572,19 @@ class Dynamics(NamedTuple):
         """The program from `columns` to impulses; `with_end_time`: no closed form ends
         it.
         """
-        kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
-        fixed = self.static_exponent, self.structure, self.max_steps, self.tangents
-        return kind(self.columns()[1], *fixed, with_end_time=with_end_time)
+        kind = ImpulseProgram
+        if self.method == "implicit":
+            kind = ImplicitProgram
+        _, tree = self.columns()
+        return kind(
+            tree,
+            self.equations,
+            self.static_exponent,
+            self.structure,
+            self.max_steps,
+            self.tangents,
+            with_end_time=with_end_time,
+        )
 
 
 def solve(
@@ -556,39 +599,42 @@ def solve(
     problem = dynamics.problem
     leaves, _ = dynamics.columns()
     if condition_check is not None:
-        second = dynamics._replace(problem=perturbed(problem)).columns()[0]
-        leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
+        again, _ = dynamics._replace(problem=perturbed(problem)).columns()
+        leaves = tuple(jnp.concatenate([x, y], axis=-1) for x, y in zip(leaves, again))
     p, side, _, code, _ = evaluate(dynamics.program(), leaves, dynamics.adjoint)
     p = p * units.momentum[:, None]
     code = code[0]
-    tangential = None
+    p_t = None
     if dynamics.tangents > 0:
         rows = dynamics.tangents // len(units.root)
-        tangential = side * jnp.repeat(units.momentum, rows)[:, None]
+        p_t = side * jnp.repeat(units.momentum, rows)[:, None]
     if condition_check is not None:
-        ill = is_ill_conditioned(condition_check, p, tangential, code, units.error)
+        ill = is_ill_conditioned(condition_check, p, p_t, code, units.error)
         code = jnp.maximum(code, jnp.where(ill, CODE["ill_conditioned"], CODE["ok"]))
-    return p[:, 0], None if tangential is None else tangential[:, 0], code[0]
+    if p_t is not None:
+        p_t = p_t[:, 0]
+    return p[:, 0], p_t, code[0]
 
 
 def is_ill_conditioned(
     contact: Contact,
     p: Float[Array, "m 2"],
-    tangential: Float[Array, "t 2"] | None,
+    p_t: Float[Array, "t 2"] | None,
     code: Int[Array, "2"],
     error: Float[Array, ""],
 ) -> Bool[Array, ""]:
     """True if velocities of two runs (columns) differ by over ILL `error`, or the
     second failed.
     """
-    if tangential is None:
-        difference = None
-    else:
-        difference = tangential[:, 1] - tangential[:, 0]
-    change = velocity_changes(contact, p[:, 1] - p[:, 0], difference)
-    return ~(
-        jnp.all(jnp.abs(change) <= ILL * error) & (code[1] <= CODE["plastic_limit"])
-    )
+    first, second = p.T
+    difference_t = None
+    if p_t is not None:
+        first_t, second_t = p_t.T
+        difference_t = second_t - first_t
+    change = velocity_changes(contact, second - first, difference_t)
+    close = jnp.all(jnp.abs(change) <= ILL * error)
+    _, second_code = code
+    return ~(close & (second_code <= CODE["plastic_limit"]))
 
 
 def perturbed(problem: Problem) -> Problem:
@@ -599,13 +645,14 @@ def perturbed(problem: Problem) -> Problem:
     constant = jax.lax.stop_gradient(problem)
     gamma = constant.gamma
     tolerance = constant.tolerance
-    held = precision(gamma.dtype).noise
-    finer = jnp.maximum(FINER * tolerance, held)
-    coarser = APART * jnp.maximum(tolerance, held)
-    last = held * (1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2))
+    noise = precision(gamma.dtype).noise
+    finer = jnp.maximum(FINER * tolerance, noise)
+    coarser = APART * jnp.maximum(tolerance, noise)
+    odd = jnp.arange(len(gamma), dtype=gamma.dtype) % 2
+    change = noise * (1 - 2 * odd)  # contact by contact up and down
     return constant._replace(
-        gamma=gamma * (1 + last),
-        omega=constant.omega * (1 - last),
+        gamma=gamma * (1 + change),
+        omega=constant.omega * (1 - change),
         tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
     )
 
@@ -619,10 +666,11 @@ def velocity_changes(
     if p_t is None:
         return contact.delassus @ p
     assert contact.tangential_block is not None
-    cross, tangent, _ = contact.tangential_block
-    return jnp.concatenate(
-        [contact.delassus @ p + cross @ p_t, cross.T @ p + tangent @ p_t]
-    )
+    w = contact.delassus
+    w_nt, w_tt, _ = contact.tangential_block
+    gamma = w @ p + w_nt @ p_t
+    u = w_nt.T @ p + w_tt @ p_t
+    return jnp.concatenate([gamma, u])
 
 
 def evaluate(

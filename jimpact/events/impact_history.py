@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
-from jimpact.events.implicit_steps import ImplicitState
+from jimpact.events.implicit_steps import ImplicitState, ImplicitSteps
 from jimpact.events.run import run
 from jimpact.events.wedged_limit import inspect
 from jimpact.numerics import stepper
+from jimpact.tools.masks import quotient
 
 
 def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":
@@ -26,6 +27,11 @@ def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":
     if isinstance(outcome, ImplicitProgram):
         return ImplicitHistoryProgram(outcome, samples)
     return HistoryProgram(outcome, samples)
+
+
+def time_of(y: Float[Array, "n B"]) -> Float[Array, "1 B"]:
+    """The time of a state, its last row."""
+    return y[-1:]
 
 
 class Seen(NamedTuple):
@@ -56,6 +62,11 @@ class HistoryProgram:
         """x, once for each sample."""
         return jnp.broadcast_to(x, (self.samples, *x.shape))
 
+    def times(self, duration: Float[Array, "1 B"]) -> Float[Array, "s 1 B"]:
+        """Times of the samples, which only choose the step of each: no tangents."""
+        fraction = self.fractions(duration.dtype)[:, None, None]
+        return fraction * jax.lax.stop_gradient(duration)[None]
+
     def fractions(self, dtype: Any) -> Float[Array, " s"]:
         """Times of the samples over the duration, from 0 to 1."""
         return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
@@ -65,14 +76,11 @@ class HistoryProgram:
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
         flow, modes, y = self.outcome.flow(problem, 1.0)
         gamma = problem.gamma
-        most = self.outcome.most
+        max_passes = self.outcome.max_passes
         checkpoints = self.outcome.checkpoints
         constant = jax.lax.stop_gradient((flow, gamma, modes, y))
-        duration = run(*constant, most, inspect, checkpoints).reached[-1:]
-        t = (
-            self.fractions(y.dtype)[:, None, None]
-            * jax.lax.stop_gradient(duration)[None]
-        )
+        duration = time_of(run(*constant, max_passes, inspect, checkpoints).reached)
+        t = self.times(duration)
 
         def observe(
             seen: Seen, now: stepper.StepperState, accept: Bool[Array, "1 B"]
@@ -81,7 +89,7 @@ class HistoryProgram:
             forces.
             """
             force = flow.contact_states(now.step.modes, now.y).force
-            may_hold_sample = accept[None] & (now.y[None, -1:] <= t)
+            may_hold_sample = accept[None] & (time_of(now.y)[None] <= t)
             return Seen(
                 jnp.where(may_hold_sample, now.y[None], seen.states),
                 jnp.where(may_hold_sample, now.step.modes[None], seen.modes),
@@ -97,39 +105,39 @@ class HistoryProgram:
             self.one_per_sample(clock),
             first,
         )
-        end = run(flow, gamma, modes, y, most, inspect, checkpoints, observe, seen)
+        end = run(
+            flow, gamma, modes, y, max_passes, inspect, checkpoints, observe, seen
+        )
         last = flow.contact_states(end.carry.step.modes, end.reached).force
         no_target = jnp.zeros(end.carry.step.target.shape, bool)
 
-        def at(
+        def sampled(
             sample: Any,
         ) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
             """Time, twice the energy and contact states of a sample, by one more
             step.
             """
-            part, state, now, clock = sample
-            rate = flow.contact_states(now, state).rate
-            since = part * end.reached[-1:] - state[-1:]
-            ahead = jnp.where(rate > 0, since / jnp.where(rate > 0, rate, 1.0), 0.0)
-            state = stepper.between(
-                flow, stepper.Step(now, no_target, clock), state, ahead
-            )
-            sample = flow.contact_states(now, state)
-            x = jnp.maximum(sample.indentation, 0.0)
-            return (
-                state[-1:],
-                flow.energy(x, jnp.zeros_like(x)),
-                sample._replace(indentation=x),
-            )
+            fraction, state, modes, clock = sample
+            rate = flow.contact_states(modes, state).rate
+            since = fraction * time_of(end.reached) - time_of(state)
+            ahead = quotient(since, rate, where=rate > 0)
+            step = stepper.Step(modes, no_target, clock)
+            state = stepper.between(flow, step, state, ahead)
+            contacts = flow.contact_states(modes, state)
+            x = jnp.maximum(contacts.indentation, 0.0)
+            energy = flow.energy(x, jnp.zeros_like(x))
+            return time_of(state), energy, contacts._replace(indentation=x)
 
-        over = t >= end.reached[None, -1:]
-        states = jnp.where(over, end.reached[None], end.seen.states)
-        now = jnp.where(over, end.carry.step.modes[None], end.seen.modes)
-        clock = jnp.where(over, 0.0, end.seen.clock)
-        rows = self.fractions(y.dtype), states, now, clock
-        time, energy, states_at = jax.lax.map(at, rows)
+        over = t >= time_of(end.reached)[None]
+        samples = (
+            self.fractions(y.dtype),
+            jnp.where(over, end.reached[None], end.seen.states),
+            jnp.where(over, end.carry.step.modes[None], end.seen.modes),
+            jnp.where(over, 0.0, end.seen.clock),
+        )
+        time, energy, contacts = jax.lax.map(sampled, samples)
         force = jnp.where(last > end.seen.force, last, end.seen.force)
-        return time, energy, *states_at, force, end.status.astype(y.dtype)
+        return time, energy, *contacts, force, end.status.astype(y.dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,64 +158,74 @@ class ImplicitHistoryProgram(HistoryProgram):
         """
         outcome = self.outcome
         flow, start = outcome.steps(jax.tree.unflatten(outcome.tree, leaves))
-        m = flow.contacts
-        most = outcome.most
+        max_passes = outcome.max_passes
         checkpoints = outcome.checkpoints
         constant = jax.lax.stop_gradient((flow, start))
-        duration = implicit_steps.run(*constant, most, checkpoints).state.time
-        # it only chooses the step of a sample; the time in the step is that of the
-        # second run
-        t = (
-            self.fractions(duration.dtype)[:, None, None]
-            * jax.lax.stop_gradient(duration)[None]
-        )
-
-        def force(s: ImplicitState) -> Float[Array, "m B"]:
-            """Normal forces in a state."""
-            return flow.force_of(s.indentation, s.velocity[:m])
+        duration = implicit_steps.run(*constant, max_passes, checkpoints).state.time
+        t = self.times(duration)
 
         def observe(
-            seen: Any, before: ImplicitState, accept: Bool[Array, "1 B"]
-        ) -> Any:
+            seen: _ImplicitSeen, now: ImplicitState, accept: Bool[Array, "1 B"]
+        ) -> _ImplicitSeen:
             """The last state before each sample, and the largest forces, up to this
             step.
             """
-            states, largest = seen
-            earlier = accept[None] & (before.time[None] <= t)
-            kept = jax.tree.map(
-                lambda a, b: jnp.where(earlier, a[None], b), before, states
+            earlier = accept[None] & (now.time[None] <= t)
+            states = jax.tree.map(
+                lambda new, old: jnp.where(earlier, new[None], old), now, seen.states
             )
-            return kept, jnp.where(accept, jnp.maximum(force(before), largest), largest)
+            larger = jnp.maximum(force_in(flow, now), seen.force)
+            return _ImplicitSeen(states, jnp.where(accept, larger, seen.force))
 
-        seen = jax.tree.map(self.one_per_sample, start), force(start)
-        run = implicit_steps.run(flow, start, most, checkpoints, observe, seen)
-        states, largest = run.seen
+        states = jax.tree.map(self.one_per_sample, start)
+        seen = _ImplicitSeen(states, force_in(flow, start))
+        run = implicit_steps.run(flow, start, max_passes, checkpoints, observe, seen)
 
-        def at(
-            sample: Any,
+        def sampled(
+            sample: tuple[jax.Array, ImplicitState],
         ) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
-            """Time, twice the energy and contact states of a sample, by one more
-            step.
-            """
-            fraction, before = sample
-            ahead = fraction * run.state.time - before.time
-            s = implicit_steps.between(flow, before, ahead)
-            x = jnp.maximum(s.indentation, 0.0)
-            gamma = s.velocity[:m]
-            sample = ContactStates(
-                force=flow.force_of(x, gamma),
-                indentation=x,
-                impulse=s.impulse[:m],
-                gap_velocity=gamma,
-                tangential_force=s.rate[m:],
-                tangential_impulse=s.impulse[m:],
-                slip=s.velocity[m:],
-                tangential_energy=s.velocity[:0],
-                # of time: these steps advance in time itself
-                rate=jnp.ones_like(s.time),
-            )
-            return s.time, flow.energy(x), sample
+            """Time, twice the energy and contact states of a sample."""
+            fraction, state = sample
+            ahead = fraction * run.state.time - state.time
+            s = implicit_steps.between(flow, state, ahead)
+            contacts = contact_states(flow, s)
+            return s.time, flow.energy(contacts.indentation), contacts
 
-        time, energy, states_at = jax.lax.map(at, (self.fractions(t.dtype), states))
+        samples = self.fractions(t.dtype), run.seen.states
+        time, energy, contacts = jax.lax.map(sampled, samples)
+        force = jnp.maximum(run.seen.force, force_in(flow, run.state))
         code = outcome.code(flow, run).astype(t.dtype)
-        return time, energy, *states_at, jnp.maximum(largest, force(run.state)), code
+        return time, energy, *contacts, force, code
+
+
+class _ImplicitSeen(NamedTuple):
+    """The last state before each sample (s, .., B), and the largest forces so far."""
+
+    states: ImplicitState
+    force: Float[Array, "m B"]
+
+
+def force_in(flow: ImplicitSteps, s: ImplicitState) -> Float[Array, "m B"]:
+    """Normal forces in a state."""
+    gamma, _ = flow.parts(s.velocity)
+    return flow.force_of(s.indentation, gamma)
+
+
+def contact_states(flow: ImplicitSteps, s: ImplicitState) -> ContactStates:
+    """The contacts in a state; of indentations below 0, gaps, those at 0."""
+    x = jnp.maximum(s.indentation, 0.0)
+    gamma, slip = flow.parts(s.velocity)
+    p, p_t = flow.parts(s.impulse)
+    _, tangential_force = flow.parts(s.rate)
+    return ContactStates(
+        force=flow.force_of(x, gamma),
+        indentation=x,
+        impulse=p,
+        gap_velocity=gamma,
+        tangential_force=tangential_force,
+        tangential_impulse=p_t,
+        slip=slip,
+        tangential_energy=s.velocity[:0],
+        # of time: these steps advance in time itself
+        rate=jnp.ones_like(s.time),
+    )

@@ -4,15 +4,15 @@ A step of length h advances indentations x and velocities w = (gamma, u) by Verl
 method along the normals, and by one convex problem in each of two stages of friction
 (`step_impulses.py`):
 
-    x_half = x - h/2 omega c(gamma) gamma              c = 1 in compression, 1 / e^2 in
-    expansion f      = h (eta + 1)/2 omega x_half^eta            impulses of the normal
-    forces
+    x_half = x - h/2 omega c(gamma) gamma
+    f      = h (eta + 1)/2 omega x_half^eta
     y1     in the discs mu f, against u at the end of a first stage of length PART h
-    y2     in the discs mu f, against u at the end of the step, after (1 - PART) y1 +
-    PART y2
+    y2     in the discs mu f, against u at the end of the step,
+           after (1 - PART) y1 + PART y2
     w     <- w + K (f, (1 - PART) y1 + PART y2)
     x     <- x_half - h/2 omega c(gamma) gamma
 
+with c = 1 in compression, 1 / e^2 in expansion, and f the impulses of normal forces.
 The stages are the two of an L-stable Runge-Kutta method of order 2, so that slip which
 stops, or creeps in balance with its forces, does not oscillate. An expansion much
 faster than the step is implicit, too: the force that it takes away within the step is
@@ -38,18 +38,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import (
+    ContactEquations,
     Coupling,
     Dense,
     Exponent,
     Viscous,
     as_pytree,
+    largest_of,
     per_row,
     power,
 )
 from jimpact.numerics.driver import SLOTS_IN_SPACE, until_over
 from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
+from jimpact.numerics.stepper import any_of
 from jimpact.numerics.tangents import dual_like, is_dual, pushforward, value_of
 from jimpact.tools.loops import cond, scan
+from jimpact.tools.masks import choose, quotient
 from jimpact.tools.precision import precision
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and
@@ -118,12 +122,13 @@ class ImplicitSteps:
     """Contacts with or without friction and their steps; n = m + t rows."""
 
     coupling: Coupling  # K (n, n, B): G and the tangential block
-    omega: Float[Array, "m B"]  # (m, B)
-    restitution: Float[Array, "m B"]  # (m, B)
-    exponent_array: Float[Array, "m B"] | None  # (m, B)
-    friction: Float[Array, "m B"]  # (m, B)
+    equations: ContactEquations
+    omega: Float[Array, "m B"]
+    restitution: Float[Array, "m B"]
+    exponent_array: Float[Array, "m B"] | None
+    friction: Float[Array, "m B"]
     descent: Float[Array, "n B"]  # see `descent_lengths`
-    tolerance: Float[Array, "1 B"]  # (1, B)
+    tolerance: Float[Array, "1 B"]
     # the same where no normal impulse is unknown
     sliding: Float[Array, "n B"] | None = None
     viscous: Viscous | None = None
@@ -149,9 +154,22 @@ class ImplicitSteps:
     @property
     def least(self) -> Float[Array, "m B"]:
         """Restitution e, not below LEAST_RESTITUTION tolerances."""
-        return self.restitution + LEAST_RESTITUTION * jax.lax.stop_gradient(
-            self.tolerance
-        )
+        tolerance = jax.lax.stop_gradient(self.tolerance)
+        return self.restitution + LEAST_RESTITUTION * tolerance
+
+    @property
+    def returned(self) -> Float[Array, "m B"]:
+        """e^2: in expansion `x' = -omega gamma / e^2`; 1 of a viscous force."""
+        if self.viscous is not None:
+            return jnp.ones_like(self.omega)
+        return self.least**2
+
+    def parts(
+        self, rows: Float[Array, "n B"]
+    ) -> tuple[Float[Array, "m B"], Float[Array, "t B"]]:
+        """The normal rows of velocities or impulses, and the tangential ones."""
+        m = self.contacts
+        return rows[:m], rows[m:]
 
     @property
     def force_scale(self) -> Float[Array, "m B"]:
@@ -172,24 +190,25 @@ class ImplicitSteps:
     def busy(self, s: ImplicitState) -> Bool[Array, "1 B"]:
         """Mask of the impacts that go on: a contact is loaded, or approaches."""
         idle = NEGLIGIBLE * self.tolerance
+        gamma, _ = self.parts(s.velocity)
         loaded = self.energy(s.indentation) > idle**2
-        return jnp.any(
-            loaded | (s.velocity[: self.contacts] < -idle), axis=0, keepdims=True
-        )
+        return any_of(loaded | (gamma < -idle))
 
     def coasted(self, s: ImplicitState) -> ImplicitState:
-        """The state when the next gap closes, x - omega gamma t = 0, if no contact is
-        loaded.
+        """The state when the next gap closes, x - omega gamma t = 0; s where a contact
+        is loaded or begins to be, or no gap closes.
         """
         x = s.indentation
-        gamma = s.velocity[: self.contacts]
+        gamma, _ = self.parts(s.velocity)
         closes = (x < 0) & (gamma < 0)
         rate = self.omega * jnp.where(closes, gamma, -1.0)
-        wait = jnp.min(jnp.where(closes, x / rate, jnp.inf), axis=0, keepdims=True)
-        free = ~jnp.any((x > 0) | ((x >= 0) & (gamma < 0)), axis=0, keepdims=True)
+        waits = jnp.where(closes, x / rate, jnp.inf)
+        wait = jnp.min(waits, axis=0, keepdims=True)
+        loaded = (x > 0) | ((x >= 0) & (gamma < 0))
+        free = ~any_of(loaded)
         wait = jnp.where(free & (wait < jnp.inf), wait, 0.0)
-        ahead = x - wait * self.omega * gamma
-        return s._replace(indentation=jnp.where(wait > 0, ahead, x), time=s.time + wait)
+        x = jnp.where(wait > 0, x - wait * self.omega * gamma, x)
+        return s._replace(indentation=x, time=s.time + wait)
 
     # ---- one step
 
@@ -198,7 +217,7 @@ class ImplicitSteps:
     ) -> Float[Array, "m B"]:
         """Normal forces `(eta + 1) / 2 omega x^eta`, or those of a viscous model."""
         if self.viscous is None:
-            return self.force_scale * power(x, self.exponent)
+            return self.equations.force(x, self.force_scale, self.exponent)
         return jnp.where(x > 0, self.viscous.push(x, gamma), 0.0)
 
     def unloading(
@@ -208,19 +227,15 @@ class ImplicitSteps:
         separation.
 
         Equation: `a = h^2 F'(x) omega / e^2`, as x falls by `h omega gamma / e^2`
-        within the step.
+        within the step, `F' = eta (eta + 1)/2 omega x^eta / x`; 0 of a viscous force.
         """
         if self.viscous is not None:
             return jnp.zeros_like(x)
         # the derivative divides by the square
         some = x > precision(x.dtype).tiny ** 0.5
-        slope = (
-            self.eta
-            * self.force_scale
-            * power(x, self.exponent)
-            / jnp.where(some, x, 1.0)
-        )
-        return h**2 * slope * self.omega / self.least**2
+        eta_f = self.eta * self.force_scale * power(x, self.exponent)
+        slope = eta_f / jnp.where(some, x, 1.0)
+        return h**2 * slope * self.omega / self.returned
 
     def moved(
         self,
@@ -229,23 +244,24 @@ class ImplicitSteps:
         h: Float[Array, "1 B"],
         stiff: Bool[Array, "m B"],
     ) -> Float[Array, "m B"]:
-        """Indentations `x - h omega c gamma` after the time h; stiff ones that expand
-        stay.
+        """Indentations after the time h.
 
-        A contact that opens within this time goes on as a gap: `e^2` as fast.
+            x - h omega c gamma       c = 1 / e^2 where a contact expands, else 1
+            e^2 x - h omega gamma     where that is below 0: from x = 0 on c = 1
+            x                         of one that is `stiff` and expands
+
+        Without gaps they are at least 0.
         """
         expands = (x > 0) & (gamma > 0)
-        if self.viscous is None:
-            square = self.least**2
-        else:
-            square = jnp.ones_like(x)
+        e_squared = self.returned
         way = h * self.omega * gamma
-        ahead = x - way / jnp.where(expands, square, 1.0)
-        ahead = jnp.where(expands & (ahead < 0), x * square - way, ahead)
-        ahead = jnp.where(stiff & expands, x, ahead)
+        after = x - way / jnp.where(expands, e_squared, 1.0)
+        opened = expands & (after < 0)
+        after = jnp.where(opened, x * e_squared - way, after)
+        after = jnp.where(stiff & expands, x, after)
         if self.gapped:
-            return ahead
-        return jnp.maximum(ahead, 0.0)
+            return after
+        return jnp.maximum(after, 0.0)
 
     def problem(
         self,
@@ -254,11 +270,14 @@ class ImplicitSteps:
         unloading: Float[Array, "m B"],
         friction: Float[Array, "m B"],
     ) -> StepProblem:
-        """The convex problem of a stage, with the lengths of descent that suit it."""
+        """The convex problem of a stage.
+
+        Its lengths of descent are those of friction alone, `sliding`, in impacts in
+        which no contact unloads implicitly, a = `unloading` = 0; else `descent`.
+        """
         descent = self.descent
         if self.sliding is not None:
-            unloads = jnp.any(unloading > 0, axis=0, keepdims=True)
-            descent = jnp.where(unloads, descent, self.sliding)
+            descent = jnp.where(any_of(unloading > 0), descent, self.sliding)
         return StepProblem(self.coupling, velocity, load, unloading, friction, descent)
 
     def substep(
@@ -272,7 +291,7 @@ class ImplicitSteps:
         """
         m = self.contacts
         x = s.indentation
-        gamma = s.velocity[:m]
+        gamma, _ = self.parts(s.velocity)
         stiff = jax.lax.stop_gradient(self.unloading(x, h)) > STIFF
         half = self.moved(x, gamma, h / 2, stiff)
         load = h * self.force_of(half, gamma)
@@ -283,73 +302,84 @@ class ImplicitSteps:
             impulses = self.normal_impulses
         impulse, rate, load, error = impulses(s, h, Middle(half, load, unloading))
         velocity = s.velocity + self.coupling.times(impulse)
-        normal = impulse[:m]
-        after = velocity[:m]
+        normal, _ = self.parts(impulse)
+        after, _ = self.parts(velocity)
 
         # where unloading has reduced the impulse, x in the middle is that of the
         # reduced force
         cut = stiff & (normal < load)
-        middle = cond(
-            jnp.any(cut),
-            lambda: jnp.where(cut, self.indentation_of(normal, h), half),
-            lambda: half,
-        )
-        x = self.moved(middle, after, h / 2, stiff)
-        x = x + jnp.where(stiff, 0.0, self.turned(s.indentation, half, gamma, after, h))
+
+        def reduced() -> Float[Array, "m B"]:
+            """x in the middle, of the reduced force where it is."""
+            return jnp.where(cut, self.indentation_of(normal, h), half)
+
+        middle = cond(jnp.any(cut), reduced, lambda: half)
+        end = self.moved(middle, after, h / 2, stiff)
+        turning = self.turned(x, half, gamma, after, h)
+        end = end + jnp.where(stiff, 0.0, turning)
         opened = cut & (normal <= 0) & (after > 0)
-        x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
-        loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
+        opening = jnp.zeros_like(x)
+        if self.gapped:
+            opening = -h / 2 * self.omega * after
+        end = jnp.where(opened, opening, end)
+        loss = self.lost(x, jnp.where(stiff, x, half), end, after)
         loss = loss + error + self.dropped(load, opened, gamma, after)
-        loss = loss + self.slackened(s.indentation, x, gamma, after, h)
+        loss = loss + self.slackened(x, end, gamma, after, h)
         # no tangents: where nothing is stored, the slope of a root would be infinite
         loss = jax.lax.stop_gradient(loss)
-        return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
+        return ImplicitState(end, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def frictional_impulses(
         self, s: ImplicitState, h: Float[Array, "1 B"], middle: Middle
     ) -> StageImpulses:
         """Impulses of a step with friction: y1 and y2 of both stages, see above."""
-        m = self.contacts
         inner = INNER * self.tolerance
-        gamma = s.velocity[:m]
+        gamma, u = self.parts(s.velocity)
         half, load, unloading = middle
+
+        def load_after(impulse: Float[Array, "n B"]) -> Float[Array, "m B"]:
+            """f at the velocity after half of this impulse of the step."""
+            change, _ = self.parts(self.coupling.times(impulse))
+            return h * self.force_of(half, gamma + change / 2)
+
         # about the force in the middle, with friction as it was
         if self.viscous is not None:
-            middle_gamma = gamma + self.coupling.times(self.guess(s.rate, load))[:m] / 2
-            load = h * self.force_of(half, middle_gamma)
+            load = load_after(self.guess(s.rate, load))
         # first stage of friction; the normal rows are those at the end of the step
-        ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
+        ahead = jnp.concatenate([gamma, u / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
-        first, error = solve(stage, self.guess(s.rate, load), inner)
-        # the force at the velocity in the middle of the step
+        first, first_error = solve(stage, self.guess(s.rate, load), inner)
+        f1, y1 = self.parts(first)
         if self.viscous is not None:
-            load = h * self.force_of(half, gamma + self.coupling.times(first)[:m] / 2)
-        side = (1 - PART) * first[m:]
+            load = load_after(first)
+        side = (1 - PART) * y1
         none = jnp.zeros_like(gamma)
         base = s.velocity + self.coupling.times(jnp.concatenate([none, side]))
         # second stage, in units in which both rows have the weight PART
         stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
-        guess = jnp.concatenate([first[:m] / PART, first[m:]])
+        guess = jnp.concatenate([f1 / PART, y1])
         second, second_error = solve(stage, guess, inner)
-        normal = PART * second[:m]
-        impulse = jnp.concatenate([normal, side + PART * second[m:]])
-        error = (1 - PART) * error + PART * second_error
+        f2, y2 = self.parts(second)
+        normal = PART * f2
         return StageImpulses(
-            impulse, jnp.concatenate([normal, second[m:]]) / h, load, error
+            impulse=jnp.concatenate([normal, side + PART * y2]),
+            rate=jnp.concatenate([normal, y2]) / h,
+            load=load,
+            error=(1 - PART) * first_error + PART * second_error,
         )
 
     def guess(
         self, rate: Float[Array, "n B"], load: Float[Array, "m B"]
     ) -> Float[Array, "n B"]:
         """Impulses (f, y): this load, and the parts of it that friction had in the last
-        step.
+        step; 0 of a contact that was not pressed.
         """
-        m = self.contacts
-        rows = len(rate) // m - 1  # tangents of a contact
-        pressed = rate[:m] > 0
-        carried = jnp.repeat(jnp.where(pressed, rate[:m], 1.0), rows, axis=0)
-        loads = jnp.repeat(jnp.where(pressed, load, 0.0), rows, axis=0)
-        return jnp.concatenate([load, rate[m:] / carried * loads])
+        tangents = len(rate) // self.contacts - 1  # of a contact
+        normal, side = self.parts(rate)
+        pressed = normal > 0
+        carried = jnp.repeat(jnp.where(pressed, normal, 1.0), tangents, axis=0)
+        loads = jnp.repeat(jnp.where(pressed, load, 0.0), tangents, axis=0)
+        return jnp.concatenate([load, side / carried * loads])
 
     def normal_impulses(
         self, s: ImplicitState, h: Float[Array, "1 B"], middle: Middle
@@ -361,7 +391,8 @@ class ImplicitSteps:
         none = jnp.zeros_like(self.tolerance)
         # never stiff; the force at the velocity in the middle
         if self.viscous is not None:
-            load = h * self.force_of(half, s.velocity + self.coupling.times(load) / 2)
+            gamma = s.velocity + self.coupling.times(load) / 2
+            load = h * self.force_of(half, gamma)
             return StageImpulses(load, load / h, load, none)
 
         def cut() -> tuple[Float[Array, "n B"], Float[Array, "1 B"]]:
@@ -377,27 +408,27 @@ class ImplicitSteps:
         self,
         x: Float[Array, "m B"],
         half: Float[Array, "m B"],
-        before: Float[Array, "m B"],
+        gamma: Float[Array, "m B"],
         after: Float[Array, "m B"],
         h: Float[Array, "1 B"],
     ) -> Float[Array, "m B"]:
         """Change of x by the moment at which gamma changes its sign within a step.
 
-        With gamma linear in time, the integral of c gamma differs from h/2 (c gamma +
-        c' gamma') by h/2 (c - c') |gamma gamma'| / (|gamma| + |gamma'|): compression
-        and expansion; or, where an open contact closes, nothing and compression.
+        With gamma linear in time up to gamma' = `after`, the integral of -omega c gamma
+        differs from the mean of both ends by
+        `h/2 omega (c' - c) |gamma gamma'| / (|gamma| + |gamma'|)`, where c = 1 holds
+        while gamma < 0 and c' while gamma > 0: 1 / e^2 of a contact that is loaded (at
+        x and `half`), 0 of an open one that closes, without gaps, and 1 of others.
         """
-        turns = before * after < 0
-        size = jnp.where(turns, jnp.abs(before) + jnp.abs(after), 1.0)
-        part = jnp.where(turns, -before * after / size, 0.0)
+        turns = gamma * after < 0
+        part = quotient(-gamma * after, jnp.abs(gamma) + jnp.abs(after), where=turns)
         loaded = (x > 0) & (half > 0)
-        if self.viscous is None:
-            square = self.least**2
-        else:
-            square = jnp.ones_like(x)
-        closes = 0.0 if self.gapped else jnp.where(before > 0, -1.0, 0.0)
-        kink = jnp.where(loaded, 1 / square - 1, closes)
-        return h / 2 * self.omega * kink * part
+        approaching = 1.0  # c
+        separating = jnp.ones_like(x)  # c'
+        if not self.gapped:
+            separating = jnp.where(gamma > 0, 0.0, separating)
+        separating = jnp.where(loaded, 1 / self.returned, separating)
+        return h / 2 * self.omega * (separating - approaching) * part
 
     def indentation_of(
         self, impulse: Float[Array, "m B"], h: Float[Array, "1 B"]
@@ -405,10 +436,11 @@ class ImplicitSteps:
         """Indentations whose force gives this normal impulse in the time h:
         `h F(x) = impulse`.
         """
-        part = impulse / (h * self.force_scale)
-        some = part > 0
-        root = jnp.exp(jnp.log(jnp.where(some, part, 1.0)) / self.eta)
-        return jnp.where(some, root, 0.0)
+        x_to_eta = impulse / (h * self.force_scale)
+        positive = x_to_eta > 0
+        log_x = jnp.log(jnp.where(positive, x_to_eta, 1.0)) / self.eta
+        x = jnp.exp(log_x)
+        return jnp.where(positive, x, 0.0)
 
     def lost(
         self,
@@ -418,58 +450,58 @@ class ImplicitSteps:
         gamma: Float[Array, "m B"],
     ) -> Float[Array, "1 B"]:
         """Largest speed over e that contacts would still have gained from what they
-        stored last.
+        stored last, x^(eta + 1), in opening within the step.
 
-        Not the speed itself: where others push a contact open, at e = 0, its expansion
-        decides.
+        Equation: `min(sqrt(E), e E / gamma)`, E from `last`, or from `x_before` where
+        that is 0; 0 of a viscous force. Not the speed itself: where others push a
+        contact open, at e = 0, its expansion decides.
         """
         if self.viscous is not None:
             return jnp.zeros_like(self.tolerance)
         left = self.energy(jnp.where(last > 0, last, x_before))
         gone = (x_before > 0) & (x <= 0) & (gamma > 0)
         root = jnp.sqrt(left)
-        faster = self.least * left / jnp.where(gamma > 0, gamma, 1.0)
-        speed = jnp.where(gone, jnp.minimum(root, faster), 0.0)
-        return jnp.max(speed, axis=0, keepdims=True)
+        faster = quotient(self.least * left, gamma, where=gamma > 0)
+        return largest_of(jnp.where(gone, jnp.minimum(root, faster), 0.0))
 
     def dropped(
         self,
         load: Float[Array, "m B"],
         opened: Bool[Array, "m B"],
-        before: Float[Array, "m B"],
+        gamma: Float[Array, "m B"],
         after: Float[Array, "m B"],
     ) -> Float[Array, "1 B"]:
         """Largest impulse until gamma is 0 of contacts that have `opened` as the step
-        begins.
+        begins: `-gamma / (gamma' - gamma)` of the load, gamma' = `after`.
 
         While they approach, their force still acts; others then push them open.
         """
-        turns = opened & (before < 0)
-        part = -before / jnp.where(turns, after - before, 1.0)
-        return jnp.max(jnp.where(turns, part * load, 0.0), axis=0, keepdims=True)
+        turns = opened & (gamma < 0)
+        part = quotient(-gamma, after - gamma, where=turns)
+        return largest_of(jnp.where(turns, part * load, 0.0))
 
     def slackened(
         self,
         x_before: Float[Array, "m B"],
         x: Float[Array, "m B"],
-        before: Float[Array, "m B"],
+        gamma: Float[Array, "m B"],
         after: Float[Array, "m B"],
         h: Float[Array, "1 B"],
     ) -> Float[Array, "1 B"]:
-        """Largest impulse of a damped force that ends, or sets in again, within the
-        step.
+        """Largest impulse `h/2 (F + F')` of a viscous force that ends, or sets in
+        again, within the step; 0 of others.
 
         It has a kink at x > 0, which the difference between one step and two halves may
         not show.
         """
         if self.viscous is None:
             return jnp.zeros_like(self.tolerance)
-        first = self.force_of(x_before, before)
+        first = self.force_of(x_before, gamma)
         last = self.force_of(x, after)
-        turns = (x_before > 0) & (x > 0) & ((first > 0) != (last > 0))
-        return jnp.max(
-            jnp.where(turns, h / 2 * (first + last), 0.0), axis=0, keepdims=True
-        )
+        changes = (first > 0) != (last > 0)
+        turns = (x_before > 0) & (x > 0) & changes
+        impulse = jnp.where(turns, h / 2 * (first + last), 0.0)
+        return largest_of(impulse)
 
     def unseen(
         self, s: ImplicitState, end: ImplicitState, h: Float[Array, "1 B"]
@@ -478,19 +510,23 @@ class ImplicitSteps:
         miss it.
         """
         closes = (s.indentation <= 0) & (end.indentation > 0)
-        force = self.force_of(end.indentation, end.velocity[: self.contacts])
-        return jnp.max(jnp.where(closes, h * force / 2, 0.0), axis=0, keepdims=True)
+        gamma, _ = self.parts(end.velocity)
+        force = self.force_of(end.indentation, gamma)
+        return largest_of(jnp.where(closes, h * force / 2, 0.0))
 
     def step(
         self, s: ImplicitState, h: Float[Array, "1 B"]
     ) -> tuple[ImplicitState, Float[Array, "1 B"]]:
         """The state after the time h, whole and in halves, and its error in tolerances.
 
-        Equation: `end + (end - whole) / 3`, `end` after both halves; error
-        `|end - whole| / 3`.
+        Equation: `end + (end - whole) / 3`, `end` after both halves, but `end` alone of
+        indentations of contacts that are not loaded after both, of `rate` and of the
+        time; error `|end - whole| / 3`, without gaps of loaded contacts, and what the
+        difference does not show (`substep`, `unseen`).
         """
+        # a scan, so that `substep` is compiled once: the whole step, then both halves
         lengths = jnp.stack([h, h / 2, h / 2])
-        whole = jnp.asarray([True, False, False])
+        wholes = jnp.asarray([True, False, False])
 
         def part(
             carry: tuple[ImplicitState, ImplicitState],
@@ -499,42 +535,44 @@ class ImplicitSteps:
             """States after the halves so far and after the whole step; the loss of a
             half.
             """
-            at, big = carry
+            halves, whole = carry
             length, is_whole = which
-            after, loss = self.substep(at, length)
+            after, loss = self.substep(halves, length)
             # guesses of impulses have no tangents
             after = after._replace(rate=jax.lax.stop_gradient(after.rate))
-            at = jax.tree.map(lambda a, b: jnp.where(is_whole, a, b), at, after)
-            big = jax.tree.map(lambda a, b: jnp.where(is_whole, b, a), big, after)
-            return (at, big), jnp.where(is_whole, 0.0, loss)
+            halves = choose(is_whole, halves, after)
+            whole = choose(is_whole, after, whole)
+            return (halves, whole), jnp.where(is_whole, 0.0, loss)
 
-        (end, big), losses = scan(part, (s, s), (lengths, whole))
-        loaded = (end.indentation > 0) & (big.indentation > 0)
-        if self.gapped:
-            counts = jnp.ones_like(loaded)
-        else:
-            counts = end.indentation > 0
-        moved = jnp.where(counts, jnp.abs(end.indentation - big.indentation), 0.0)
-        changed = jnp.abs(end.velocity - big.velocity)
-        error = jnp.max(jnp.concatenate([moved, changed]), axis=0, keepdims=True) / 3
-        size = jnp.max(jnp.abs(end.velocity), axis=0, keepdims=True)
+        (end, whole), losses = scan(part, (s, s), (lengths, wholes))
+        difference = jnp.abs(end.indentation - whole.indentation)
+        if not self.gapped:
+            difference = jnp.where(end.indentation > 0, difference, 0.0)
+        changed = jnp.abs(end.velocity - whole.velocity)
+        differences = jnp.concatenate([difference, changed])
+        error = largest_of(differences) / 3
         if self.viscous is not None:
             error = error + self.unseen(s, end, h)
+        size = largest_of(jnp.abs(end.velocity))
         allowed = ALLOWED * self.tolerance + precision(h.dtype).accumulated * size
-        better = jax.tree.map(lambda a, b: a + (a - b) / 3, end, big)
+        better = jax.tree.map(lambda a, b: a + (a - b) / 3, end, whole)
+        loaded = (end.indentation > 0) & (whole.indentation > 0)
         x = jnp.where(loaded, jnp.maximum(better.indentation, 0.0), end.indentation)
         new = better._replace(indentation=x, rate=end.rate, time=end.time)
         return new, (error + jnp.sum(losses, axis=0)) / allowed
 
 
 def descent_of(coupling: Coupling, contacts: int) -> Float[Array, "n B"]:
-    """Lengths of descent of a coupling; see `descent_lengths`."""
+    """Lengths of descent of a coupling; see `descent_lengths`.
+
+    Of a chain or a packing 1 over the largest sum of |G_ij| of a row, for all.
+    """
     if isinstance(coupling, Dense):
         return descent_lengths(coupling.matrix, contacts)
-    batch = jax.tree.leaves(coupling)[0].shape[-1]
-    ones = jnp.ones((contacts, batch), jax.tree.leaves(coupling)[0].dtype)
-    row_sums = coupling.magnitude().times(ones)
-    return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
+    entries, *_ = jax.tree.leaves(coupling)
+    ones = jnp.ones((contacts, entries.shape[-1]), entries.dtype)
+    sums = coupling.magnitude().times(ones)
+    return ones / jnp.max(sums, axis=0, keepdims=True) * jnp.ones_like(sums)
 
 
 class ImplicitRun(NamedTuple):
@@ -545,9 +583,9 @@ class ImplicitRun(NamedTuple):
     passes: Int[Array, "1 B"]  # steps tried
     seen: Any  # by `observe`, see `run`
 
-    def over(self, flow: ImplicitSteps, most: int) -> Bool[Array, "1 B"]:
+    def over(self, flow: ImplicitSteps, max_passes: int) -> Bool[Array, "1 B"]:
         """Mask of the impacts that have ended or are given up."""
-        stalled = (self.length < SHORTEST) | (self.passes >= most)
+        stalled = (self.length < SHORTEST) | (self.passes >= max_passes)
         return stalled | ~flow.busy(value_of(self.state))
 
 
@@ -578,7 +616,7 @@ def attempt(
     new = with_tangents_of(state, new)
     error = jax.lax.stop_gradient(value_of(error))
     accepted = live & (error <= 1)
-    state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, state)
+    state = choose(accepted, new, state)
     return state, jnp.where(live, next_length(length, error), length), accepted
 
 
@@ -591,7 +629,7 @@ def with_tangents_of(flow: Any, state: ImplicitState) -> ImplicitState:
 def run(
     flow: ImplicitSteps,
     start: ImplicitState,
-    most: int,
+    max_passes: int,
     checkpoints: bool = False,
     observe: Callable[[Any, ImplicitState, jax.Array], Any] | None = None,
     seen: Any = None,
@@ -609,7 +647,7 @@ def run(
 
     def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> Bool[Array, "1 B"]:
         """Mask of the impacts that are not over."""
-        return ~run.over(value_of(flow), most)
+        return ~run.over(value_of(flow), max_passes)
 
     def attempt_all(flow: ImplicitSteps, run: ImplicitRun) -> ImplicitRun:
         """The impacts after one step tried in all that go on."""
@@ -631,13 +669,18 @@ def run(
 def between(
     flow: ImplicitSteps, s: ImplicitState, ahead: Float[Array, "1 B"]
 ) -> ImplicitState:
-    """The state at the time `ahead` after s, within the step that follows it."""
+    """The state at the time `ahead` after s, within the step that follows it.
+
+    Until the next gap closes indentations change by `-omega gamma ahead` alone.
+    """
     coasted = flow.coasted(s)
-    waits = ahead < coasted.time - s.time
-    drifted = s.indentation - ahead * flow.omega * s.velocity[: flow.contacts]
-    length = ahead - (coasted.time - s.time)
+    gamma, _ = flow.parts(s.velocity)
+    wait = coasted.time - s.time
+    waits = ahead < wait
+    drifted = s.indentation - ahead * flow.omega * gamma
+    length = ahead - wait
     steps = ~waits & (length > 0)
     new, _ = flow.substep(coasted, jnp.where(steps, length, FIRST))
-    new = jax.tree.map(lambda a, b: jnp.where(steps, a, b), new, s)
-    at = jnp.where(waits, drifted, new.indentation)
-    return new._replace(indentation=at, time=s.time + ahead)
+    new = choose(steps, new, s)
+    x = jnp.where(waits, drifted, new.indentation)
+    return new._replace(indentation=x, time=s.time + ahead)

@@ -71,7 +71,8 @@ def comes_to_rest(
     asked: Bool[Array, "1 B"],
 ) -> Bool[Array, "1 B"]:
     """Mask of the impacts whose contacts of the `block` come to rest, with the impulses
-    dp.
+    dp: the look remained clear, what is left is below the tolerance, and so are the
+    velocities of the block.
 
     No other contact then carries anything. Only the impacts `asked` are looked at.
     """
@@ -81,6 +82,7 @@ def comes_to_rest(
     visible = flow.tolerance * jnp.maximum(flow.taking_part, 2) / 2
     steps = ImplicitSteps(
         coupling=flow.coupling,
+        equations=flow.equations,
         omega=flow.omega,
         restitution=flow.restitution,
         exponent_array=flow.exponent_array,
@@ -105,12 +107,13 @@ def comes_to_rest(
 
     def is_clear(s: ImplicitState) -> Bool[Array, "1 B"]:
         """Mask: no contact of the block is close to separating, and no other one
-        carries.
+        carries more than the tolerance.
 
-        Close: `dp - p < MARGIN` times its approach or root of the energy.
+        Close: `dp - p < MARGIN` times its approach or root of the energy, if that is
+        more than COMPARED visible errors.
         """
-        own = holds(s)
-        close = (own > COMPARED * visible) & (dp - s.impulse < MARGIN * own)
+        held = holds(s)
+        close = (held > COMPARED * visible) & (dp - s.impulse < MARGIN * held)
         return ~any_of(jnp.where(block, close, s.impulse > flow.tolerance))
 
     def coarse_step(steps: ImplicitSteps, look: _Look) -> _Look:
@@ -124,8 +127,14 @@ def comes_to_rest(
         return _Look(state, length, look.passes + live.astype(jnp.int32), clear)
 
     start = steps.start(x, flow.scales(modes) * g)
-    none = jnp.zeros(visible.shape, jnp.int32)
-    first = _Look(start, FIRST * jnp.ones_like(visible), none, is_clear(start))
+    first = _Look(
+        state=start,
+        length=FIRST * jnp.ones_like(visible),
+        passes=jnp.zeros(visible.shape, jnp.int32),
+        clear=is_clear(start),
+    )
     end = until_over(goes_on, coarse_step, steps, first)
-    rests = ~any_of(block & (jnp.abs(end.state.velocity) > visible)) & any_of(block)
-    return asked & end.clear & (size(end.state) <= LEFT * visible) & rests
+    moves = jnp.abs(end.state.velocity) > visible
+    rests = any_of(block) & ~any_of(block & moves)
+    over = size(end.state) <= LEFT * visible
+    return asked & end.clear & over & rests

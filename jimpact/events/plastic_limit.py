@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jimpact.events.contact_flow import OFTEN, ContactFlow
+from jimpact.events.contact_flow import OFTEN, ContactFlow, largest_of
 from jimpact.events.look_ahead import comes_to_rest
 from jimpact.events.run import Rest
 from jimpact.numerics import stepper
@@ -32,6 +32,7 @@ from jimpact.numerics.sparse import Iterate, conjugate_step
 from jimpact.numerics.stepper import Mark, any_of, total
 from jimpact.numerics.tangents import value_of
 from jimpact.tools.loops import cond, fori_loop, scan
+from jimpact.tools.masks import choose
 
 # Velocity in tolerances, below which a contact that re-closed often is at rest once the
 # rest of its bounces is neglected. Ten times more: slow contacts of long chains count
@@ -66,17 +67,17 @@ def inspect(
     """Contacts at rest in impacts `which` pause or, `at_end`, are over; else those of
     `rest`.
 
-    Of impacts that are over, where contacts that closed often hardly move.
+    Impacts that pause are asked about by `contacts_at_rest`; of those that are over
+    those with contacts that closed often and hardly move (`hardly_moving`). Where that
+    finds none in a long chain, a look ahead may be due: `block_at_rest`.
     """
     flow, values = _values(flow, carry)
     gamma, rest = jax.lax.stop_gradient((gamma, rest))
     if at_end:
-        resting = which & at_rest(flow, values)
-    else:
-        resting = jnp.zeros_like(rest.contacts)
-    if at_end:
+        resting = which & hardly_moving(flow, values)
         due = any_of(resting)
     else:
+        resting = jnp.zeros_like(rest.contacts)
         due = which
     rest = cond(
         jnp.any(due),
@@ -93,16 +94,16 @@ def inspect(
     )
 
 
-def at_rest(flow: ContactFlow, end: stepper.StepperState) -> Bool[Array, "m B"]:
-    """Mask of contacts as good as at rest where some of them re-closed again and
-    again.
+def hardly_moving(flow: ContactFlow, end: stepper.StepperState) -> Bool[Array, "m B"]:
+    """Mask of contacts with |gamma| <= QUIET tolerances, in impacts in which one of
+    them has closed ENDLESS times or more.
     """
-    m = flow.contacts
     modes = end.step.modes
-    gamma = flow.scales(modes) * flow.rows(end.y)[1]
+    gamma = flow.scales(modes) * flow.rows(end.y).g
     # no wider than what ended the impact: a ball of a long chain may be slower
     resting = jnp.abs(gamma) <= QUIET * flow.patience(end.passes)
-    return resting & any_of(resting & (modes[m : 2 * m] >= ENDLESS))
+    endless = flow.modes(modes).closings >= ENDLESS
+    return resting & any_of(resting & endless)
 
 
 def contacts_at_rest(
@@ -117,40 +118,63 @@ def contacts_at_rest(
 
     Contacts at rest carry what keeps each of them from approaching:
     `0 <= dp _|_ gamma+ >= 0`, on the gamma+ that their impulses give: errors of many
-    closings add up.
+    closings add up. After a pause an impact ends if each contact that closes often
+    carries, each other one has settled, and gamma, the root of the energy, and dp of
+    those that close often return as a multiple `ratio` of what they were.
     """
-    m = flow.contacts
     modes = carry.step.modes
     state = carry.y
-    count = modes[m : 2 * m]  # closings so far
-    since = count - last.closings
-    most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
-    paused = (carry.mark == Mark.PAUSED) & (most > before) & (most >= OFTEN)
+    closings = flow.modes(modes).closings
+    since = closings - last.closings
+    now_most = largest_of(closings)
+    paused = (carry.mark == Mark.PAUSED) & (now_most >= OFTEN)
+    paused = paused & (now_most > largest_of(last.closings))
     # closed since the last inspection at least half as often as any other contact
-    often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
-    rest = resting | often  # contacts asked about
-    now = gamma + flow.change(state)
+    often = paused & (2 * since >= largest_of(since)) & (closings > 0)
+    asked = resting | often
+    gamma = gamma + flow.change(state)  # now
 
-    start = often | (rest & (now < 0))
-    carries, dp = plastic_impulses(flow, rest, start, now)
+    start = often | (asked & (gamma < 0))
+    carries, dp = plastic_impulses(flow, asked, start, gamma)
 
-    # is (gamma, root of the energy, dp) a multiple of that at the last inspection?
-    root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
-    rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
-    size, old = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))
-    ratio = size[:1] / jnp.where(old[:1] > 0, old[:1], size[:1])
-    returns = jnp.abs(rows - ratio * last.rows) <= SHAPE * (1 - ratio) * size
-    after = now + flow.coupling.times(dp)  # gamma+
-    # the impact ends if its state returns, and all but those contacts have settled
-    settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (
-        after >= -flow.tolerance
-    )
-    meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
+    of_often = jnp.where(often, gamma, 0.0)
+    x, _, _ = flow.rows(state)
+    root = jnp.sqrt(flow.energy(x, jnp.zeros_like(x)))
+    root = jnp.where(often, root, 0.0)
+    dp_often = jnp.where(often, dp, 0.0)
+    size = largest_of(jnp.abs(of_often))
+    old = largest_of(jnp.abs(last.gamma))
+    ratio = size / jnp.where(old > 0, old, size)
+    returns = _returns(of_often, last.gamma, ratio)
+    returns = returns & _returns(root, last.root, ratio)
+    returns = returns & _returns(dp_often, last.impulse, ratio)
+
+    after = gamma + flow.coupling.times(dp)  # gamma+
+    works, _, _ = flow.at_work(modes, state, flow.tolerance)
+    settled = ~works & (after >= -flow.tolerance)
+    meets = jnp.where(often, carries, settled) & returns
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
     rest = resting | (often & ends)
-    new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends, last.cycle)
+    new = Rest(
+        contacts=rest,
+        carries=rest & carries,
+        gamma=of_often,
+        root=root,
+        impulse=dp,
+        closings=closings,
+        ended=ends,
+        cycle=last.cycle,
+    )
     inspected = paused | any_of(resting)
-    return jax.tree.map(lambda a, b: jnp.where(inspected, a, b), new, last)
+    return choose(inspected, new, last)
+
+
+def _returns(
+    x: Float[Array, "m B"], old: Float[Array, "m B"], ratio: Float[Array, "1 B"]
+) -> Bool[Array, "m B"]:
+    """Mask: x is `ratio old`, but for a part SHAPE of what its size falls by."""
+    allowed = SHAPE * (1 - ratio) * largest_of(jnp.abs(x))
+    return jnp.abs(x - ratio * old) <= allowed
 
 
 def block_at_rest(
@@ -163,41 +187,41 @@ def block_at_rest(
     """`rest`, but the contacts of a block where a look ahead is `due` and shows its
     rest.
     """
-    now = gamma + flow.change(carry.y)
-    everywhere = jnp.ones_like(now, bool)
-    block, dp = plastic_impulses(flow, everywhere, everywhere, now)
-    after = now + flow.coupling.times(dp)  # gamma+
-    admissible = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
+    gamma = gamma + flow.change(carry.y)  # now
+    everywhere = jnp.ones_like(gamma, bool)
+    block, dp = plastic_impulses(flow, everywhere, everywhere, gamma)
+    after = gamma + flow.coupling.times(dp)  # gamma+
+    pulls = jnp.where(block, dp, 0.0) < 0
+    admissible = ~any_of(pulls | (after < -flow.tolerance))
     ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & admissible)
-    rows = rest.rows.at[2].set(dp)
-    new = Rest(block, block, rows, rest.closings, ended, rest.cycle)
-    return jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, rest)
+    new = rest._replace(contacts=block, carries=block, impulse=dp, ended=ended)
+    return choose(ended, new, rest)
 
 
 def plastic_impulses(
     flow: ContactFlow,
     allowed: Bool[Array, "m B"],
     start: Bool[Array, "m B"],
-    now: Float[Array, "m B"],
+    gamma: Float[Array, "m B"],
 ) -> tuple[Bool[Array, "m B"], Float[Array, "m B"]]:
-    """Mask of the `allowed` contacts that carry, and the impulses dp:
-    `0 <= dp _|_ gamma+ >= 0`.
+    """Mask of the `allowed` contacts that carry, and the impulses dp with
+    `0 <= dp _|_ gamma + G dp >= 0`.
 
-    `start`: those that are taken to carry at first; `now`: gamma.
+    `start`: those that are taken to carry at first.
     """
 
     def choose(
-        _: Any, both: tuple[Bool[Array, "m B"], Float[Array, "m B"]]
+        _: Any, last: tuple[Bool[Array, "m B"], Float[Array, "m B"]]
     ) -> tuple[Bool[Array, "m B"], Float[Array, "m B"]]:
         """Contacts that carry, less those that would pull, and those that still
         approach; dp.
         """
-        carries, _ = both
-        dp = impulse_of_rest(flow, carries, now)
-        after = now + flow.coupling.times(dp)
+        carries, _ = last
+        dp = impulse_of_rest(flow, carries, gamma)
+        after = gamma + flow.coupling.times(dp)
         return allowed & jnp.where(carries, dp > 0, after < 0), dp
 
-    return fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(now)))
+    return fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(gamma)))
 
 
 def final_impulses(
@@ -213,35 +237,42 @@ def final_impulses(
     closings before, whose derivatives grow with each of them and would cancel but for
     rounding.
     """
-    m = flow.contacts
-    p = flow.rows(state)[2]
+    rows = flow.rows(state)
+    p = rows.p
 
     def solved() -> Float[Array, "m B"]:
         """Impulses with which contacts R are at rest; those of the others."""
-        # the rows of p
-        others = state.at[2 * m : 3 * m].set(jnp.where(carries, 0.0, p))
+        of_others = rows._replace(p=jnp.where(carries, 0.0, p))
+        others = flow.with_rows(state, of_others)
         # gamma + W p
-        at_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))
-        return jnp.where(carries, at_rest, p)
+        p_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))
+        return jnp.where(carries, p_rest, p)
 
     return cond(jnp.any(carries), solved, lambda: p)
 
 
 def impulse_of_rest(
-    flow: ContactFlow, carries: Bool[Array, "m B"], after: Float[Array, "m B"]
+    flow: ContactFlow, carries: Bool[Array, "m B"], gamma: Float[Array, "m B"]
 ) -> Float[Array, "m B"]:
-    """dp of the contacts R that carry, with which gamma_R + (G dp)_R = 0: conjugate
-    gradients.
+    """dp with `gamma_R + (G dp)_R = 0` of the contacts R that carry, 0 of others.
+
+    By conjugate gradients.
     """
-    right = jnp.where(carries, -after, 0.0)
+    right = jnp.where(carries, -gamma, 0.0)
 
     def product(x: Float[Array, "m B"]) -> Float[Array, "m B"]:
         """G x in the contacts that carry, 0 elsewhere."""
         return jnp.where(carries, flow.coupling.times(x), 0.0)
 
-    def step(at: Iterate, _: None) -> tuple[Iterate, None]:
-        """State after one step of conjugate gradients in each impact."""
-        return conjugate_step(product, lambda x, y: total(x * y), at)[0], None
+    def scalar(x: Float[Array, "m B"], y: Float[Array, "m B"]) -> Float[Array, "1 B"]:
+        """Scalar products of each impact."""
+        return total(x * y)
 
-    start = Iterate(jnp.zeros_like(right), right, right, total(right * right))
-    return scan(step, start, None, length=2 * right.shape[0])[0].x
+    def step(now: Iterate, _: Any) -> tuple[Iterate, None]:
+        """One step of conjugate gradients in each impact."""
+        after, _ = conjugate_step(product, scalar, now)
+        return after, None
+
+    start = Iterate(jnp.zeros_like(right), right, right, scalar(right, right))
+    end, _ = scan(step, start, None, length=2 * right.shape[0])
+    return end.x

@@ -2,13 +2,12 @@
 its end.
 
 FLOW    contacts without or with friction (`contact_flow.py`, `friction_flow.py`,
-`slip.py`)
+        `slip.py`)
 STEP    `numerics/stepper.py` tries one, which ends at an event if one lies within it
 PAUSE   where a flow asks for it, `inspect` judges whether the impact will come to rest
-by itself
-        (`plastic_limit.py`), and ends it there
+        by itself (`plastic_limit.py`), and ends it there
 END     all contacts are open and none approaches: the flow finishes the state in closed
-form
+        form
 """
 
 from collections.abc import Callable
@@ -33,9 +32,9 @@ class Rest(NamedTuple):
 
     contacts: Bool[Array, "m B"]  # whose closings have no end
     carries: Bool[Array, "m B"]  # those of them that carry an impulse
-    # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of
-    # the approach
-    rows: Float[Array, "3 m B"]
+    gamma: Float[Array, "m B"]
+    root: Float[Array, "m B"]  # of twice the energy stored
+    impulse: Float[Array, "m B"]  # dp, which takes what is left of the approach
     closings: Int[Array, "m B"]
     ended: Bool[Array, "1 B"]  # by a state that returned as a part of itself
     # of contacts that friction may wedge: see `wedged_limit.py`
@@ -45,8 +44,16 @@ class Rest(NamedTuple):
     def none(cls, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]) -> "Rest":
         """The state before the first inspection: no contact is at rest."""
         no = jnp.zeros(gamma.shape, bool)
-        rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
-        return cls(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
+        zero = jnp.zeros_like(gamma)
+        return cls(
+            contacts=no,
+            carries=no,
+            gamma=zero,
+            root=zero,
+            impulse=zero,
+            closings=jnp.zeros(gamma.shape, modes.dtype),
+            ended=jnp.zeros((1, *gamma.shape[1:]), bool),
+        )
 
 
 class ImpactEnd(NamedTuple):
@@ -59,13 +66,13 @@ class ImpactEnd(NamedTuple):
 
     @property
     def carries(self) -> Bool[Array, "m B"]:
-        """Mask of the contacts at rest that carry an impulse; uses both, see it."""
+        """Mask of the contacts at rest that carry an impulse."""
         return self.rest.carries & self.rest.contacts
 
     @property
     def impulse(self) -> Float[Array, "m B"]:
         """Impulses of the contacts at rest that end their approach."""
-        return jnp.where(self.carries, self.rest.rows[2], 0.0)
+        return jnp.where(self.carries, self.rest.impulse, 0.0)
 
     @property
     def over(self) -> Bool[Array, "1 B"]:
@@ -105,7 +112,7 @@ def run(
     gamma: Float[Array, "m B"],
     modes: Int[Array, "modes B"],
     y: Any,
-    most: int,
+    max_passes: int,
     inspect: Inspect,
     checkpoints: bool = False,
     observe: Observe | None = None,
@@ -121,7 +128,7 @@ def run(
         gamma: gap velocities before the impact.
         modes: of the contacts at first.
         y: the state at first (n, B).
-        most: passes.
+        max_passes: passes after which it is given up.
         inspect: asked where a self-similar flow pauses, and at the end of each.
         checkpoints: the loop has a reverse mode, and no forward mode.
         observe: `observe(seen, state, accept)` follows the states before each step, and
@@ -129,10 +136,10 @@ def run(
         seen: what `observe` begins with.
     """
 
-    def one_pass(at: tuple[Any, jax.Array], now: _OnItsWay) -> _OnItsWay:
+    def one_pass(constant: tuple[Any, jax.Array], now: _OnItsWay) -> _OnItsWay:
         """The impact after one step tried; impacts that pause are inspected."""
-        flow, gamma = at
-        carry, accept = stepper.advance(flow, now.carry, most)
+        flow, gamma = constant
+        carry, accept = stepper.advance(flow, now.carry, max_passes)
         if observe is not None:
             now = now._replace(seen=observe(now.seen, now.carry, accept))
         paused = carry.mark == Mark.PAUSED
@@ -148,14 +155,14 @@ def run(
     slots = value_of(flow).slots
     if is_dual(y):
         slots = min(slots, SLOTS_WITH_TANGENTS)
-    last = until_over(
-        lambda _, now: stepper.goes_on(now.carry, most),
-        one_pass,
-        (flow, gamma),
-        start,
-        checkpoints,
-        slots if observe is None else None,
-    )
+    if observe is not None:
+        slots = None  # all impacts side by side
+
+    def goes_on(_: Any, now: _OnItsWay) -> Bool[Array, "1 B"]:
+        """Mask of the impacts that are not over."""
+        return stepper.goes_on(now.carry, max_passes)
+
+    last = until_over(goes_on, one_pass, (flow, gamma), start, checkpoints, slots)
     return _finished(flow, gamma, last, inspect)
 
 
@@ -171,14 +178,16 @@ def _finished(
     def at_end(flow: Any, y: Float[Array, "n B"]) -> Float[Array, "n B"]:
         """The state, finished where the impact is over."""
         modes = carry.step.modes
-        finished = jnp.where(over, flow.finish(modes, y)[1], y)
+        finished = jnp.where(over, flow.finished(modes, y), y)
         if rest.cycle is None:
             return finished
-        return cond(
-            jnp.any(rest.ended),
-            lambda: jnp.where(rest.ended, flow.settled(modes, y, rest.cycle), finished),
-            lambda: finished,
-        )
+
+        def settled() -> Float[Array, "n B"]:
+            """The limit of wedged contacts where the impact has ended by it."""
+            limit = flow.settled(modes, y, rest.cycle)
+            return jnp.where(rest.ended, limit, finished)
+
+        return cond(jnp.any(rest.ended), settled, lambda: finished)
 
     y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
     end = carry._replace(y=y)

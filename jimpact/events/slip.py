@@ -10,20 +10,19 @@ therefore one of three modes, and its two rows of slip mean
 
     STICKS   0
     SLIPS    ln r and angle, while the whole field advances in a time that is shortened
-    by
-             1 + sum (|a| + c K_tt) / r over the contacts that slip: no rate is large
+             by 1 + sum (|a| + c K_tt) / r over the contacts that slip: no rate is large
              then, and slip comes to a stop at the FLOOR after a few steps, as ln r
              falls at a steady rate
     CREEPS   r and angle, 0 included: r is so small that the direction follows from the
-        forces, to
-             first order in r. It obeys n . a = r angle': the angle is a state that
-             drifts as the solution drifts, and one Newton step corrects the direction.
+             forces, to first order in r. It obeys n . a = r angle': the angle is a
+             state that drifts as the solution drifts, and one Newton step corrects the
+             direction.
 
 and of a contact without load the Cartesian slip velocity. Slip sets in by creeping,
 from r = 0 where stick ends; where the stiffness c K_tt / r has fallen enough, it SLIPS.
 Where several contacts stick redundantly (two corners of one body) one may reach its
-cone while others hold it: it
-creeps with r = 0. Sticking forces are eliminated from the field once a step.
+cone while others hold it: it creeps with r = 0. Sticking forces are eliminated from the
+field once a step.
 """
 
 import dataclasses
@@ -35,13 +34,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jimpact.events.contact_flow import ContactStates, Frozen, as_pytree
-from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.contact_flow import ContactStates, Frozen, as_pytree, largest_of
+from jimpact.events.friction_flow import FrictionFlow, FrictionRows
 from jimpact.numerics.dense import product, pseudoinverse, solve, times, unit
 from jimpact.numerics.driver import SLOTS_IN_SPACE
 from jimpact.numerics.friction import distribute
 from jimpact.numerics.stepper import any_of, total
 from jimpact.tools.loops import cond
+from jimpact.tools.masks import quotient
 
 
 class Slip(enum.IntEnum):
@@ -77,17 +77,17 @@ class Reduced(NamedTuple):
     """The field with sticking forces eliminated: `a = pull F + tangent lambda` of those
     that slide.
 
-    gamma' = coupling F + normal_tangent lambda;  forces of sticking -(held F + carried
-    lambda).
+    `gamma' = coupling F + normal_tangent lambda`; forces of sticking are
+    `-(held F + carried lambda)`.
     """
 
     frozen: Frozen
-    coupling: Float[Array, "m m B"]  # (m, m, B)
-    normal_tangent: Float[Array, "m t B"]  # (m, t, B)
-    pull: Float[Array, "t m B"]  # (t, m, B)
-    tangent: Float[Array, "t t B"]  # (t, t, B)
-    held: Float[Array, "t m B"]  # (t, m, B)
-    carried: Float[Array, "t t B"]  # (t, t, B)
+    coupling: Float[Array, "m m B"]
+    normal_tangent: Float[Array, "m t B"]
+    pull: Float[Array, "t m B"]
+    tangent: Float[Array, "t t B"]
+    held: Float[Array, "t m B"]
+    carried: Float[Array, "t t B"]
 
 
 class SlipRates(NamedTuple):
@@ -120,16 +120,25 @@ def twice(rows: Shaped[Array, "m *B"]) -> Shaped[Array, "t *B"]:
     return jnp.repeat(rows, 2, axis=0)
 
 
+def parts(
+    pair: Shaped[Array, "m 2 *B"],
+) -> tuple[Shaped[Array, "m *B"], Shaped[Array, "m *B"]]:
+    """Both rows of each contact, apart."""
+    return pair[:, 0], pair[:, 1]
+
+
 def length(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
     """Lengths |u_j|, with derivative 0 at 0."""
-    square = pair[:, 0] ** 2 + pair[:, 1] ** 2
+    x, y = parts(pair)
+    square = x**2 + y**2
     some = square > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
 
 
 def perpendicular_to(direction: Float[Array, "m 2 B"]) -> Float[Array, "m 2 B"]:
     """Vectors (-y, x): (x, y) turned by a right angle."""
-    return jnp.stack([-direction[:, 1], direction[:, 0]], 1)
+    x, y = parts(direction)
+    return jnp.stack([-y, x], 1)
 
 
 @jax.custom_jvp
@@ -174,15 +183,23 @@ def turned(
 
 def angle_of(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
     """Angles of directions; 0, without a derivative, of the zero vector."""
-    some = (pair[:, 0] != 0) | (pair[:, 1] != 0)
-    return jnp.arctan2(
-        jnp.where(some, pair[:, 1], 0.0), jnp.where(some, pair[:, 0], 1.0)
-    )
+    x, y = parts(pair)
+    some = (x != 0) | (y != 0)
+    return jnp.arctan2(jnp.where(some, y, 0.0), jnp.where(some, x, 1.0))
 
 
 def dot(a: Float[Array, "m 2 B"], b: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
     """Scalar products of the vectors of each contact."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
+    x_a, y_a = parts(a)
+    x_b, y_b = parts(b)
+    return x_a * x_b + y_a * y_b
+
+
+def _solved(
+    matrix: Float[Array, "m m B"], right: Float[Array, "m B"]
+) -> Float[Array, "m B"]:
+    """x with `matrix x = right`."""
+    return solve(matrix, right[:, None])[:, 0]
 
 
 @as_pytree
@@ -198,25 +215,22 @@ class SlipFlow(FrictionFlow):
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 
     def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "m 2 B"]:
-        """Both rows of slip of each contact."""
-        m = self.contacts
-        return pairs(y[3 * m : 5 * m])
+        """Both rows of slip of each contact: r or ln r, and angle; see above."""
+        return pairs(self.slip_rows(y))
 
     def with_slip(
         self, y: Float[Array, "n B"], q: Float[Array, "m 2 B"]
     ) -> Float[Array, "n B"]:
         """The state with these rows of slip."""
-        m = self.contacts
-        return jnp.concatenate([y[: 3 * m], flat(q), y[5 * m :]])
+        return self.friction_rows(y)._replace(u=flat(q)).packed()
 
     def start_with(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state before the impact, from gamma, indentations x and slip u."""
-        m = self.contacts
         modes, y = self.start(gamma, x)
-        modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
-        y = jnp.concatenate([y[: 3 * m], u, jnp.zeros_like(u), y[3 * m :]])
+        modes = self.with_slip_modes(modes, jnp.full(x.shape, Slip.STICKS))
+        y = self.with_tangents(y, u)
         loaded = self.loaded(modes)
         return self.decided(modes, y, jnp.zeros_like(loaded), loaded)
 
@@ -224,7 +238,7 @@ class SlipFlow(FrictionFlow):
         self, modes: Int[Array, "modes B"]
     ) -> tuple[Bool[Array, "m B"], Bool[Array, "m B"], Bool[Array, "m B"]]:
         """Masks of the loaded contacts that stick, that slip, and that creep."""
-        slip = modes[2 * self.contacts :]
+        slip = self.modes(modes).slip
         loaded = self.loaded(modes)
         sticks, slips, creeps = (loaded & (slip == kind) for kind in Slip)
         return sticks, slips, creeps
@@ -232,31 +246,35 @@ class SlipFlow(FrictionFlow):
     def speed(
         self, modes: Int[Array, "modes B"], q: Float[Array, "m 2 B"]
     ) -> Float[Array, "m B"]:
-        """Speeds r of slip of loaded contacts; 0 of those that stick."""
+        """Speeds r of slip of loaded contacts, of rows q; 0 of those that stick, or are
+        not loaded.
+        """
         _, slips, creeps = self.sliding(modes)
-        return jnp.where(
-            slips,
-            jnp.exp(jnp.where(slips, q[:, 0], 0.0)),
-            jnp.where(creeps, q[:, 0], 0.0),
-        )
+        r, _ = parts(q)  # ln r of those that slip
+        creep = jnp.where(creeps, r, 0.0)
+        return jnp.where(slips, jnp.exp(jnp.where(slips, r, 0.0)), creep)
+
+    def cartesian(
+        self, modes: Int[Array, "modes B"], q: Float[Array, "m 2 B"]
+    ) -> Float[Array, "m 2 B"]:
+        """Slip u = r d of loaded contacts, of rows q."""
+        _, angle = parts(q)
+        along, _ = polar(jnp.where(self.loaded(modes), angle, 0.0))
+        return self.speed(modes, q)[:, None] * along
 
     def allowance(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> Float[Array, "n B"]:
-        """Allowed error of each row, in tolerances; of ln r and angle it grows as 1 /
-        r.
+        """Allowed error of each row, in tolerances: 1, but of ln r and angle 1 / r, at
+        most LOOSE / tolerance, and of the angle of creep SLOW_ANGLE / sqrt(tolerance).
         """
-        m = self.contacts
-        one = jnp.ones_like(y[: self.contacts])
         _, slips, creeps = self.sliding(modes)
-        relative = LOOSE / self.tolerance
-        steep = jnp.where(
-            slips, jnp.exp(-jnp.where(slips, self.slip(y)[:, 0], 0.0)), 1.0
-        )
-        steep = jnp.clip(steep, 1.0, jnp.maximum(relative, 1.0))
-        turning = jnp.where(creeps, SLOW_ANGLE / jnp.sqrt(self.tolerance), steep)
-        rows = flat(jnp.stack([steep, turning], 1))
-        return jnp.concatenate([one, one, one, rows, jnp.ones_like(y[5 * m :])])
+        log_r, _ = parts(self.slip(y))
+        inverse = jnp.where(slips, jnp.exp(-jnp.where(slips, log_r, 0.0)), 1.0)
+        inverse = jnp.clip(inverse, 1.0, jnp.maximum(LOOSE / self.tolerance, 1.0))
+        slow = SLOW_ANGLE / jnp.sqrt(self.tolerance)
+        angle = jnp.where(creeps, slow, inverse)
+        return self.with_slip(jnp.ones_like(y), jnp.stack([inverse, angle], 1))
 
     # ---- the protocol
 
@@ -289,8 +307,11 @@ class SlipFlow(FrictionFlow):
     def motion(
         self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> SlipRates:
-        """Forces, and the rates of slip `r' = d . a`, `angle' = n . a / r` of those
-        that slip.
+        """Forces, and the rates of slip in time over `unit`, a = u'.
+
+        slips     (ln r)' = d . a / r,   angle' = n . a / r
+        creeps    r' = d . a,            angle' = drift + correction, see `_creep`
+        unloaded  u' = a
         """
         frozen = const.frozen
         x, g, _ = self.rows(y)
@@ -299,9 +320,10 @@ class SlipFlow(FrictionFlow):
         q = self.slip(y)
         f = self.force(frozen, x, g)
         c = jnp.where(slides, self.friction * f, 0.0)  # mu F
-        angle = jnp.where(slides, q[:, 1], 0.0)
+        _, angle = parts(q)
+        angle = jnp.where(slides, angle, 0.0)
         r = self.speed(modes, q)
-        over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
+        over_r = quotient(frozen.unit, r, where=slips)
         frame = polar(angle)
         drift, correction = self._creep(const, modes, y, f, c, frame, over_r)
         direction, perpendicular = turned(frame, correction)
@@ -310,33 +332,29 @@ class SlipFlow(FrictionFlow):
         # r' = d . a and r angle' = n . a
         grows = dot(direction, a)
         turns = dot(perpendicular, a)
-        rate = jnp.stack(
-            [
-                jnp.where(
-                    slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)
-                ),
-                jnp.where(slips, over_r * turns, drift + correction),
-            ],
-            1,
+        creep = jnp.where(creeps, frozen.unit * grows, 0.0)
+        dr = jnp.where(slips, over_r * grows, creep)
+        dangle = jnp.where(slips, over_r * turns, drift + correction)
+        du = (frozen.unit * jnp.ones_like(x))[:, None] * a
+        loaded = self.loaded(modes)[:, None]
+        fastest = over_r * (length(a) + 2 * self._stiffness(const, c))
+        return SlipRates(
+            force=f,
+            sliding=side,
+            holding=self._holding(const, stick, f, side),
+            rate=jnp.where(loaded, jnp.stack([dr, dangle], 1), du),
+            direction=direction,
+            turning=jnp.where(slips, over_r * turns, drift),
+            haste=1 + total(fastest),
         )
-        # rows of contacts without load are u itself
-        rate = jnp.where(
-            self.loaded(modes)[:, None],
-            rate,
-            (frozen.unit * jnp.ones_like(x))[:, None] * a,
-        )
-        haste = 1 + total(over_r * (length(a) + 2 * self._stiffness(const, c)))
-        holding = self._holding(const, stick, f, side)
-        turning = jnp.where(slips, over_r * turns, drift)
-        return SlipRates(f, side, holding, rate, direction, turning, haste)
 
     def _stiffness(self, const: Reduced, c: Float[Array, "m B"]) -> Float[Array, "m B"]:
         """Stiffness c K_tt of the angle, K_tt the mean of the two directions of a
         contact.
         """
         rows = np.arange(2 * self.contacts)
-        diagonal = pairs(const.tangent[rows, rows])
-        return c * (diagonal[:, 0] + diagonal[:, 1]) / 2
+        k_1, k_2 = parts(pairs(const.tangent[rows, rows]))
+        return c * (k_1 + k_2) / 2
 
     def _holding(
         self,
@@ -372,15 +390,18 @@ class SlipFlow(FrictionFlow):
         of `frame`.
 
         `c` is mu F, `frame` the directions d and n, `over_r` 1 / r of the contacts that
-        slip. With G = n . a of all contacts that creep, G' at fixed angles and J =
-        -dG/d angle, the quasi-static solution G = 0 drifts by J^-1 G'. The directions
-        lag behind it by
-        (J + diag(r'))^-1 r drift, as r angle' = G and r grows at the rate r'.
+        slip. With G = n . a of all contacts that creep, G' at fixed angles and
+        J = -dG/d angle, the quasi-static solution G = 0 drifts by J^-1 G'. Newton's
+        step J^-1 G leads to it, and the directions lag behind it by
+        `(J + diag(r'))^-1 r drift`, as r angle' = G and r grows at the rate r'. The
+        deviation is Newton's step less the lag, at most one radian. Of other contacts
+        both are 0.
         """
         frozen = const.frozen
         x, g, _ = self.rows(y)
         *_, creeps = self.sliding(modes)
-        r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
+        r, _ = parts(self.slip(y))
+        r = jnp.where(creeps, r, 0.0)
         direction, perpendicular = frame
 
         def acceleration(
@@ -402,7 +423,8 @@ class SlipFlow(FrictionFlow):
         _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
         dc = jnp.where(c > 0, self.friction * df, 0.0)
         swung = (c * over_r * turns)[:, None] * perpendicular
-        changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - swung))
+        dside = -dc[:, None] * direction - swung
+        changes = dot(perpendicular, acceleration(df, dside))
         # J = n K_tt n c + diag(r'), all in units of the largest entry: forces begin at
         # 0
         blocks = self._blocks(const)
@@ -413,45 +435,43 @@ class SlipFlow(FrictionFlow):
             for i in range(2)
             for k in range(2)
         )
-        j = jnp.where(creeps[:, None] & creeps[None], j * c[None], 0.0)
-        size = jnp.max(
-            jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows), axis=0, keepdims=True
-        )
+        both_creep = creeps[:, None] & creeps[None]
+        j = jnp.where(both_creep, j * c[None], 0.0)
+        size = largest_of(jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows))
         size = jnp.where(size > 0, size, 1.0)
         growth = jnp.where(creeps, grows / size, 0.0)
-        j, eye = j / size[None], unit(j)
-        turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
+        eye = unit(j)
+        j = j / size[None]
+        turns = jnp.where(creeps, turns / size, 0.0)
+        changes = jnp.where(creeps, changes / size, 0.0)
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
         jacobian = j + eye * (growth + away)[:, None]
-        drift, newton = (solve(jacobian, z[:, None])[:, 0] for z in (changes, turns))
-        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
-            j + eye * (2 * growth + away)[:, None]
-        )
-        lag = solve(lagging + eye * LEAST_STIFFNESS, (r * drift / size)[:, None])[:, 0]
+        drift = _solved(jacobian, changes)
+        newton = _solved(jacobian, turns)
+        lagging = j + eye * (2 * growth + away)[:, None]
+        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * lagging
+        lag = _solved(lagging + eye * LEAST_STIFFNESS, r * drift / size)
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
     def contact_states(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> ContactStates:
-        """Forces, velocities and slip in a state."""
-        m = self.contacts
+        """Forces, velocities and slip in a state; u of loaded contacts is r d."""
         x, g, p = self.rows(y)
         const = self.constants(modes)
         loaded = self.loaded(modes)
         q = self.slip(y)
         motion = self.motion(const, modes, y)
-        cartesian = (
-            self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
-        )
+        u = jnp.where(loaded[:, None], self.cartesian(modes, q), q)
         return ContactStates(
             force=motion.force,
             indentation=x,
             impulse=p,
             gap_velocity=const.frozen.scale * g,
             tangential_force=motion.sliding + motion.holding,
-            tangential_impulse=y[5 * m : 7 * m],
-            slip=flat(jnp.where(loaded[:, None], cartesian, q)),
+            tangential_impulse=self.side_impulse(y),
+            slip=flat(u),
             tangential_energy=y[:0],
             rate=const.frozen.unit / motion.haste,
         )
@@ -464,23 +484,19 @@ class SlipFlow(FrictionFlow):
 
         Equation: `g' = ratio (G F + K_nt lambda)`, without the forces of sticking in K.
         """
-        _, g, _ = self.rows(y)
         frozen = const.frozen
         motion = self.motion(const, modes, y)
-        pull = times(const.coupling, motion.force) + times(
-            const.normal_tangent, motion.sliding
+        across = times(const.normal_tangent, motion.sliding)
+        pull = times(const.coupling, motion.force) + across
+        rates = FrictionRows(
+            x=frozen.closing * self.rows(y).g,
+            g=frozen.ratio * pull,
+            p=frozen.unit * motion.force,
+            u=flat(motion.rate),
+            side=frozen.unit * (motion.sliding + motion.holding),
+            time=frozen.unit,
         )
-        dy = jnp.concatenate(
-            [
-                frozen.closing * g,
-                frozen.ratio * pull,
-                frozen.unit * motion.force,
-                flat(motion.rate),
-                frozen.unit * (motion.sliding + motion.holding),
-                frozen.unit,
-            ]
-        )
-        return dy / motion.haste
+        return rates.packed() / motion.haste
 
     def margins(
         self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
@@ -506,25 +522,24 @@ class SlipFlow(FrictionFlow):
         creep ends   (slow - r) / (slow + |r|), r less 2 FLOOR tolerance; see CREEP for
         slow
         """
-        r = self.slip(y)[:, 0]
+        r, _ = parts(self.slip(y))  # ln r of those that slip
         stick, slips, creeps = self.sliding(modes)
         floor = FLOOR * self.tolerance
-        stops = jnp.where(slips, r - jnp.log(floor), jnp.where(creeps, r + floor, 1.0))
+        stops = jnp.where(creeps, r + floor, 1.0)
+        stops = jnp.where(slips, r - jnp.log(floor), stops)
         # all forces of an impact vanish together: the room in the cone is one in parts
         # of them
         size = total(f)
         room = self.friction * f - length(pairs(holding))
-        room = jnp.where(size > 0, room / jnp.where(size > 0, size, 1.0), 1.0)
-        stiffness = self._stiffness(
-            const, jnp.where(slips | creeps, self.friction * f, 0.0)
-        )
+        room = quotient(room, size, where=size > 0, otherwise=1.0)
+        c = jnp.where(slips | creeps, self.friction * f, 0.0)
+        stiffness = self._stiffness(const, c)
         slow = CREEP * jnp.sqrt(self.tolerance) * const.frozen.unit * stiffness
         creep = jnp.where(creeps, r, 0.0) - 2 * floor
         slow = (slow - creep) / (slow + jnp.abs(creep))
         ends = jnp.where(stick, room, jnp.where(creeps, slow, 1.0))
-        return jnp.concatenate(
-            [self.normal_margins(const.frozen, modes, y), stops, ends]
-        )
+        normal = self.normal_margins(const.frozen, modes, y)
+        return jnp.concatenate([normal, stops, ends])
 
     def margins_with_rates(
         self,
@@ -539,32 +554,33 @@ class SlipFlow(FrictionFlow):
         Forces of sticking depend on the directions of creep, whose rates are those of
         first order, but where a step lands on the rim of a cone.
         """
-        m = self.contacts
         motion = self.motion(const, modes, y)
+        f = motion.force
         stick, slips, creeps = self.sliding(modes)
         x, g, _ = self.rows(y)
         dx, dg, _ = self.rows(dy)
         _, df = jax.jvp(lambda x, g: self.force(const.frozen, x, g), (x, g), (dx, dg))
         dc = jnp.where(slips | creeps, self.friction * df, 0.0)[:, None]
-        c = jnp.where(slips | creeps, self.friction * motion.force, 0.0)
-        turned = (c * motion.turning / motion.haste)[:, None] * perpendicular_to(
-            motion.direction
-        )
-        dside = -flat(dc * motion.direction + turned)
+        c = jnp.where(slips | creeps, self.friction * f, 0.0)
+        dangle = (c * motion.turning / motion.haste)[:, None]
+        swung = dangle * perpendicular_to(motion.direction)
+        dside = -flat(dc * motion.direction + swung)
+        dholding = self._holding(const, stick, df, dside)
         value, rates = jax.jvp(
             lambda y, f, holding: self._margins_of(const, modes, y, f, holding),
-            (y, motion.force, motion.holding),
-            (dy, df, self._holding(const, stick, df, dside)),
+            (y, f, motion.holding),
+            (dy, df, dholding),
         )
-        if m == 1:
+        if self.contacts == 1:
             return value, rates
-        needed = jnp.any(target[3 * m :] & stick & any_of(creeps))
-        rates = cond(
-            needed,
-            lambda: jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))[1],
-            lambda: rates,
-        )
-        return value, rates
+
+        def exact() -> Float[Array, "k B"]:
+            """Rates with those of the directions of creep."""
+            _, rates = jax.jvp(lambda y: self.margins(const, modes, y), (y,), (dy,))
+            return rates
+
+        on_rim = self.kinds(target).cone & stick & any_of(creeps)
+        return value, cond(jnp.any(on_rim), exact, lambda: rates)
 
     def switch(
         self,
@@ -577,39 +593,35 @@ class SlipFlow(FrictionFlow):
         A contact that opens keeps u = r d, one that breaks loose creeps from r = 0, and
         creep that ends goes on with ln r.
         """
-        m = self.contacts
-        stopped = which[2 * m : 3 * m]
-        ended = which[3 * m :]
+        _, _, stopped, ended = self.kinds(which)
         stick, slips, creeps = self.sliding(modes)
         loaded = self.loaded(modes)
         q = self.slip(y)
-        slip = modes[2 * m :]
-        cartesian = (
-            self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
-        )
+        r, angle = parts(q)
+        u = self.cartesian(modes, q)
         breaks = stick & ended
         grows = creeps & ended
         # a contact breaks loose against the force that held it, Newton's method sees to
         # the rest
         const = self.constants(modes)
-        f = self.force(const.frozen, *self.rows(y)[:2])
-        side = (
-            jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None]
-            * polar(q[:, 1])[0]
-        )
+        x, g, _ = self.rows(y)
+        f = self.force(const.frozen, x, g)
+        direction, _ = polar(angle)
+        side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * direction
         pulled = pairs(times(const.held, f) + times(const.carried, flat(side)))
         away = angle_of(jnp.where(breaks[:, None], pulled, 0.0))
-        logarithm = jnp.log(jnp.where(grows, q[:, 0], 1.0))
+        log_r = jnp.log(jnp.where(grows, r, 1.0))
         q = jnp.where(breaks[:, None], jnp.stack([jnp.zeros_like(away), away], 1), q)
-        q = jnp.where(grows[:, None], jnp.stack([logarithm, q[:, 1]], 1), q)
-        slip = jnp.where(breaks, Slip.CREEPS, jnp.where(grows, Slip.SLIPS, slip))
-        after, y = self.normal_switch(modes, y, which[: 2 * m])
-        after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
+        q = jnp.where(grows[:, None], jnp.stack([log_r, angle], 1), q)
+        slip = self.modes(modes).slip
+        slip = jnp.where(grows, Slip.SLIPS, slip)
+        slip = jnp.where(breaks, Slip.CREEPS, slip)
+        after, y = self.normal_switch(modes, y, which)
+        after = self.with_slip_modes(after, slip)
         remains = self.loaded(after)
-        q = jnp.where((loaded & ~remains)[:, None], cartesian, q)
-        return self.decided(
-            after, self.with_slip(y, q), stopped & remains, remains & ~loaded
-        )
+        q = jnp.where((loaded & ~remains)[:, None], u, q)
+        y = self.with_slip(y, q)
+        return self.decided(after, y, stopped & remains, remains & ~loaded)
 
     def decided(
         self,
@@ -621,46 +633,41 @@ class SlipFlow(FrictionFlow):
         """Modes and state once it is decided which contacts stick, and where others
         creep to.
 
-        `distribute` decides anew where slip has `stopped`, or a contact has `closed`
-        without slip, from the forces of a moment later.
+        A contact that has `closed` with slip slips along it: its Cartesian rows become
+        ln r and angle. `distribute` decides anew where slip has `stopped`, or a contact
+        has `closed` without slip, from the forces of a moment later: of these contacts,
+        of those that stick, and of those below REST.
         """
-        m = self.contacts
         q = self.slip(y)
-        slip = modes[2 * m :]
+        slip = self.modes(modes).slip
         loaded = self.loaded(modes)
         stick = loaded & (slip == Slip.STICKS) & ~closed
         r = jnp.where(closed, length(q), self.speed(modes, q))
         resting = loaded & (r <= REST * self.tolerance) & ~stick
-        # contacts that close with slip: its Cartesian rows become ln r and angle
         slips = closed & ~resting
-        moving = jnp.where(slips[:, None], q, 1.0)
-        q = jnp.where(
-            slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q
-        )
+        u = jnp.where(slips[:, None], q, 1.0)
+        of_slip = jnp.stack([jnp.log(length(u)), angle_of(u)], 1)
+        q = jnp.where(slips[:, None], of_slip, q)
         slip = jnp.where(slips, Slip.SLIPS, slip)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | stick)
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
-        most = constant.friction * f
+        cone = constant.friction * f  # mu F
         # b = u' by normal forces and by the friction of contacts that slide on
-        slides = jnp.where(
-            (to_check | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
-        )
+        _, angle = parts(q)
+        along, _ = polar(jax.lax.stop_gradient(angle))
+        sliding = jnp.where((to_check | ~loaded)[:, None], 0.0, along)
         b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f)
-        b = b - times(constant.tangent, flat(most[:, None] * slides))
-        inside, towards = distribute(constant.tangent, b, most, to_check)
-        towards = angle_of(pairs(towards))
-        # stick is (0, 0), creep begins at r = 0
-        begins = jnp.stack(
-            [jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1
-        )
+        b = b - times(constant.tangent, flat(cone[:, None] * sliding))
+        inside, towards = distribute(constant.tangent, b, cone, to_check)
+        angle = jnp.where(inside, 0.0, angle_of(pairs(towards)))
+        begins = jnp.stack([jnp.zeros_like(angle), angle], 1)  # r = 0
         lost = jnp.where((closed & resting)[:, None], q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)
         checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
-        slip = jnp.where(to_check, checked, slip).astype(modes.dtype)
-        modes = jnp.concatenate([modes[: 2 * m], slip])
-        pressed = to_check & (most > 0)
+        modes = self.with_slip_modes(modes, jnp.where(to_check, checked, slip))
+        pressed = to_check & (cone > 0)
         held = pressed & inside
         begun = pressed & closed & resting & ~inside
         return modes, self._stopped(modes, self.with_slip(y, q), lost, held, begun)
@@ -674,34 +681,65 @@ class SlipFlow(FrictionFlow):
         begun: Bool[Array, "m B"],
     ) -> Float[Array, "n B"]:
         """The state after slips `lost`, whose values are 0, have been taken from
-        contacts `held`.
+        contacts `held`, and from those that have `begun` to slide.
 
-        As in the plane: the tangents of these slips are taken by a tangential impulse;
-        of contacts that have `begun` to slide those across their direction, which
-        friction takes at once.
+        As in the plane it changes tangents alone: by the tangential impulse p_t that
+        takes the slips (`_impulse_of_rest`), `dgamma = K_nt p_t`, `du = K_tt p_t`.
+        """
+        state = self.friction_rows(y)
+        q = self.slip(y)
+        p_t = self._impulse_of_rest(q, lost, held, begun)
+        p_t = p_t - jax.lax.stop_gradient(p_t)
+        dg = self.as_rows(modes, times(self.normal_tangent, p_t))
+        dq = self._changes_of_slip(modes, q, pairs(times(self.tangent, p_t)))
+        state = state._replace(g=state.g + dg, u=flat(q + dq), side=state.side + p_t)
+        return state.packed()
+
+    def _impulse_of_rest(
+        self,
+        q: Float[Array, "m 2 B"],
+        lost: Float[Array, "m 2 B"],
+        held: Bool[Array, "m B"],
+        begun: Bool[Array, "m B"],
+    ) -> Float[Array, "t B"]:
+        """p_t with `lost + K_tt p_t = 0` in contacts `held`; in contacts that have
+        `begun` to slide across their direction alone, which friction takes at once.
+
+        In the basis E of each contact, (d, n) of one that has begun, else its tangents:
+        `p_t = E z`, `z = -(E^T K_tt E)^+ E^T lost` in these rows.
         """
         m = self.contacts
-        x, g, p = self.rows(y)
-        q = self.slip(y)
-        along, across = polar(jnp.where(begun, q[:, 1], 0.0))
-        # of each contact; the tangents where it sticks
-        frame = jnp.stack([along, across], 2)
-        blocks = self.tangent.reshape(m, 2, m, 2, -1)
-        blocks = jnp.einsum("iaxB,iajbB,jbyB->ixjyB", frame, blocks, frame)
-        rows = flat(jnp.stack([held, held | begun], 1))
-        right = flat(-jnp.einsum("iaxB,iaB->ixB", frame, lost))
-        taken = times(pseudoinverse(blocks.reshape(self.tangent.shape), rows), right)
-        side = flat(jnp.einsum("iaxB,ixB->iaB", frame, pairs(taken)))
-        side = side - jax.lax.stop_gradient(side)
-        g = g + self.as_rows(modes, times(self.normal_tangent, side))
-        du = pairs(times(self.tangent, side))
+        _, angle = parts(q)
+        along, across = polar(jnp.where(begun, angle, 0.0))
+        basis = jnp.stack([along, across], 2)
+        k = self.tangent.reshape(m, 2, m, 2, -1)
+        k = jnp.einsum("iaxB,iajbB,jbyB->ixjyB", basis, k, basis)
+        inverse = pseudoinverse(
+            k.reshape(self.tangent.shape), flat(jnp.stack([held, held | begun], 1))
+        )
+        z = times(inverse, flat(-jnp.einsum("iaxB,iaB->ixB", basis, lost)))
+        return flat(jnp.einsum("iaxB,ixB->iaB", basis, pairs(z)))
+
+    def _changes_of_slip(
+        self,
+        modes: Int[Array, "modes B"],
+        q: Float[Array, "m 2 B"],
+        du: Float[Array, "m 2 B"],
+    ) -> Float[Array, "m 2 B"]:
+        """Changes of the rows q of slip by du, to first order.
+
+        slips     ln r by d . du / r, angle by n . du / r
+        creeps    r by d . du
+        unloaded  u by du
+        sticks    none
+        """
         _, slips, creeps = self.sliding(modes)
-        along, across = polar(jnp.where(slips | creeps, q[:, 1], 0.0))
+        slides = slips | creeps
+        _, angle = parts(q)
+        along, across = polar(jnp.where(slides, angle, 0.0))
         r = jnp.where(slips, self.speed(modes, q), 1.0)
         turn = jnp.where(slips, dot(across, du), 0.0)
         polars = jnp.stack([dot(along, du), turn], 1) / r[:, None]
         free = ~self.loaded(modes)
-        q = q + jnp.where(
-            (slips | creeps)[:, None], polars, jnp.where(free[:, None], du, 0.0)
-        )
-        return jnp.concatenate([x, g, p, flat(q), y[5 * m : 7 * m] + side, y[7 * m :]])
+        dq = jnp.where(free[:, None], du, 0.0)
+        return jnp.where(slides[:, None], polars, dq)

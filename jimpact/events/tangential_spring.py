@@ -7,8 +7,8 @@ With the normal force F of the indentation x a contact j has a spring of stiffne
     slides   xi = mu F / k_t n,  lambda = -mu F n,       while n . (u - xi') >= 0
 
 where n is the direction of xi, and u - xi' is the slip. In the units of
-`contact_flow.py`, with
-F = (eta + 1)/2 omega x^eta and xi in those of x, `k_t = kappa eta F / x`: the cone is
+`contact_flow.py`, with F = (eta + 1)/2 omega x^eta and xi in those of x,
+`k_t = kappa eta F / x`: the cone is
 
     kappa eta |xi| <= mu x,
 
@@ -20,25 +20,23 @@ falls to 0: a spring that is still loaded then slides. A contact closes with xi 
 In space n turns while the contact slides: xi' has no component across n but that of u,
 so
 
-    angle' = A / x sin(phi - angle),   A = kappa eta omega |u| / mu,   phi the angle of
-    u.
+    angle' = A / x sin(phi - angle),   A = kappa eta omega |u| / mu,
+
+phi the angle of u.
 
 This is stiff where x is small. A loaded contact has therefore one of three modes:
 
     HOLDS    xi is a state
     SLIDES   the angle is a state, and the whole field advances in a time that is
-    shortened by one
-             and the sum of the rates A / x
+             shortened by one and the sum of the rates A / x
     DRAGS    A / x is so large that n follows u, behind it by phi' x / (A + x'), exact
-    where phi'
-             is steady and x a power of time: a contact that closes while it slides
+             where phi' is steady and x a power of time: a contact that closes while it
+             slides
 
 STATE   x, g, p (m each), u, xi, impulse of lambda (t each), time. In space the rows of
-xi are 0 and
-        the angle while a contact slides.
+        xi are 0 and the angle while a contact slides.
 MODES   phase, closings, slip (m each): 0 holds; in the plane +-1, the direction in
-which it slides;
-        in space 1 slides, 2 drags.
+        which it slides; in space 1 slides, 2 drags.
 """
 
 import dataclasses
@@ -54,6 +52,7 @@ from jimpact.events.contact_flow import (
     ContactStates,
     Frozen,
     as_pytree,
+    largest_of,
     per_row,
 )
 from jimpact.events.friction_flow import FrictionFlow
@@ -62,6 +61,7 @@ from jimpact.events.slip import (
     angle_of,
     dot,
     length,
+    parts,
     perpendicular_to,
     towards,
     turned,
@@ -69,6 +69,7 @@ from jimpact.events.slip import (
 from jimpact.numerics.dense import times
 from jimpact.numerics.driver import SLOTS, SLOTS_IN_SPACE
 from jimpact.numerics.stepper import total
+from jimpact.tools.masks import quotient
 
 # Longest step in the time in which a spring moves by one radian. Errors of a spring
 # without load show in derivatives only: ten times more, and these are wrong.
@@ -125,7 +126,7 @@ class SpringFlow(FrictionFlow):
     @property
     def in_space(self) -> bool:
         """True with two tangents a contact."""
-        return self.normal_tangent.shape[1] == 2 * self.contacts
+        return self.tangents == 2 * self.contacts
 
     @property
     def slots(self) -> int:  # type: ignore[override]
@@ -140,7 +141,7 @@ class SpringFlow(FrictionFlow):
     def driving(self) -> tuple[int, ...]:
         """Sizes of the blocks x, g, p, u and xi."""
         m = self.contacts
-        t = self.normal_tangent.shape[1]
+        t = self.tangents
         return m, m, m, t, t
 
     @property
@@ -155,21 +156,21 @@ class SpringFlow(FrictionFlow):
 
     @property
     def longest(self) -> Float[Array, "1 B"]:  # type: ignore[override]
-        """One radian of the fastest spring; in space at most the step that is
-        stable.
+        """The longest step: RADIAN over the rate of the fastest spring, in space at
+        most STABLE.
+
+        Equation: `rate^2 <= max_i sum_j |K_tt|_ij k_t omega_j`, with
+        `k_t = kappa eta (eta + 1)/2 omega_j` at x = 1.
         """
-        scale = self.steep * (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
-        rows = jnp.repeat(
-            scale * self.omega, len(self.tangent) // self.contacts, axis=0
-        )
-        square = jnp.max(times(jnp.abs(self.tangent), rows), axis=0, keepdims=True)
+        eta = per_row(self.exponent, self.omega)
+        k_t_omega = self.steep * (eta + 1) / 2 * self.omega * self.omega
+        of_rows = jnp.repeat(k_t_omega, self.tangents // self.contacts, axis=0)
+        square = largest_of(times(jnp.abs(self.tangent), of_rows))
         if self.in_space:
-            most = STABLE
+            square = jnp.maximum(square, (RADIAN / STABLE) ** 2)
         else:
-            most = jnp.inf
-        return jax.lax.stop_gradient(
-            RADIAN / jnp.sqrt(jnp.maximum(square, (RADIAN / most) ** 2))
-        )
+            square = jnp.maximum(square, 0.0)
+        return jax.lax.stop_gradient(RADIAN / jnp.sqrt(square))
 
     def by_contact(self, rows: Float[Array, "t B"]) -> Float[Array, "m b B"]:
         """Tangential rows of each contact side by side."""
@@ -177,15 +178,12 @@ class SpringFlow(FrictionFlow):
 
     def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "t B"]:
         """Tangential velocity u."""
-        m = self.contacts
-        t = self.normal_tangent.shape[1]
-        return y[3 * m : 3 * m + t]
+        return self.slip_rows(y)
 
     def spring(self, y: Float[Array, "driving B"]) -> Float[Array, "m b B"]:
         """Rows of xi."""
-        m = self.contacts
-        t = self.normal_tangent.shape[1]
-        return self.by_contact(y[3 * m + t : 3 * m + 2 * t])
+        begin = 3 * self.contacts + self.tangents
+        return self.by_contact(y[begin : begin + self.tangents])
 
     def elongation(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
         """|xi| of contacts that hold, with derivative 0 at 0."""
@@ -197,20 +195,21 @@ class SpringFlow(FrictionFlow):
         self, y: Float[Array, "n B"], xi: Float[Array, "m b B"]
     ) -> Float[Array, "n B"]:
         """The state with these rows of xi."""
-        m = self.contacts
-        t = self.normal_tangent.shape[1]
-        rows = xi.reshape(t, *xi.shape[2:])
-        return jnp.concatenate([y[: 3 * m + t], rows, y[3 * m + 2 * t :]])
+        begin = 3 * self.contacts + self.tangents
+        end = begin + self.tangents
+        rows = xi.reshape(self.tangents, *xi.shape[2:])
+        return jnp.concatenate([y[:begin], rows, y[end:]])
 
     def start_with(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state before the impact, from gamma, indentations x and slip u."""
-        m = self.contacts
         modes, y = self.start(gamma, x)
-        none = jnp.zeros_like(u)
-        modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
-        y = jnp.concatenate([y[: 3 * m], u, none, none, y[3 * m :]])
+        modes = self.with_slip_modes(modes, jnp.full(x.shape, Slide.HOLDS))
+        xi = jnp.zeros_like(u)
+        side = jnp.zeros_like(u)
+        time = y[-1:]
+        y = jnp.concatenate([*self.rows(y), u, xi, side, time])
         return self.closed(modes, y, self.loaded(modes))
 
     # ---- the protocol
@@ -225,9 +224,8 @@ class SpringFlow(FrictionFlow):
         """
         if not self.in_space:
             return 1.0
-        m = self.contacts
-        slides = self.loaded(modes) & (modes[2 * m :] == Slide.SLIDES)
-        depth = jnp.clip(y[:m], self.tolerance, 1.0)
+        slides = self.loaded(modes) & (self.modes(modes).slip == Slide.SLIDES)
+        depth = jnp.clip(self.rows(y).x, self.tolerance, 1.0)
         angle = jnp.where(slides, 1 / depth, 1.0)
         ones = jnp.ones_like(y)
         return self.with_spring(ones, jnp.stack([jnp.ones_like(angle), angle], 1))
@@ -235,7 +233,7 @@ class SpringFlow(FrictionFlow):
     def constants(self, modes: Int[Array, "modes B"]) -> Any:
         """Factors of the normal field, and which contacts are loaded and slide."""
         loaded = self.loaded(modes)
-        slides = loaded & (modes[2 * self.contacts :] != 0)
+        slides = loaded & (self.modes(modes).slip != 0)
         return SpringConstants(self.normal_constants(modes), loaded, slides)
 
     def aim(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
@@ -253,21 +251,18 @@ class SpringFlow(FrictionFlow):
     ) -> Float[Array, "t B"]:
         """Tangential forces: holding `-kappa eta F / x xi`, sliding `-mu F n`."""
         x, *_ = self.rows(y)
-        deep = x > 0
-        secant = jnp.where(deep, f / jnp.where(deep, x, 1.0), 0.0)  # F / x
+        secant = quotient(f, x, where=x > 0)
         held = -(self.steep * secant)[:, None] * self.spring(y)
         sliding = -(self.friction * f)[:, None] * n
-        return jnp.where(const.slides[:, None], sliding, held).reshape(
-            self.slip(y).shape
-        )
+        side = jnp.where(const.slides[:, None], sliding, held)
+        return side.reshape(self.slip(y).shape)
 
     def slip_acceleration(
         self, f: Float[Array, "m B"], side: Float[Array, "t B"]
     ) -> Float[Array, "t B"]:
         """`u' = K_tn F + K_tt lambda`."""
-        return times(jnp.swapaxes(self.normal_tangent, 0, 1), f) + times(
-            self.tangent, side
-        )
+        tangent_normal = jnp.swapaxes(self.normal_tangent, 0, 1)
+        return times(tangent_normal, f) + times(self.tangent, side)
 
     def direction(
         self,
@@ -281,34 +276,31 @@ class SpringFlow(FrictionFlow):
         In the plane the mode; in space of the angle, or, where it drags, that of u
         turned back by `phi' x / (A + x')`, phi' = u x u' / |u|^2 by forces along u.
         """
-        slip = modes[2 * self.contacts :]
+        slip = self.modes(modes).slip
         if not self.in_space:
             return slip[:, None].astype(y.dtype)
         x, g, _ = self.rows(y)
+        mu = self.friction
         u = self.by_contact(self.slip(y))
         drags = slip == Slide.DRAGS
         speed = length(u)
         moves = drags & (speed > 0)
         size = jnp.where(moves, speed, 1.0)
-        along = jnp.where(
-            moves[:, None], u / size[:, None], jnp.array([1.0, 0.0])[None, :, None]
-        )
-        of_angle = towards(jnp.where(slip == Slide.SLIDES, self.spring(y)[:, 1], 0.0))
+        fixed = jnp.array([1.0, 0.0])[None, :, None]
+        along = jnp.where(moves[:, None], u / size[:, None], fixed)
+        _, angle = parts(self.spring(y))
+        of_angle = towards(jnp.where(slip == Slide.SLIDES, angle, 0.0))
         first = jnp.where(drags[:, None], along, of_angle)
-        rate = self.by_contact(self.slip_acceleration(f, self.side(const, y, f, first)))
-        turns = jnp.where(moves, dot(perpendicular_to(along), rate) / size, 0.0)  # phi'
+        side = self.side(const, y, f, first)
+        du = self.by_contact(self.slip_acceleration(f, side))
+        dphi = jnp.where(moves, dot(perpendicular_to(along), du) / size, 0.0)
         # x' in time: closing g / unit, but 0 where an expansion takes no time
         unit = const.frozen.unit
-        lasts = unit > 0
-        sinks = jnp.where(
-            lasts, const.frozen.closing * g / jnp.where(lasts, unit, 1.0), 0.0
-        )
-        pace = self.aim(y) + self.friction * sinks
-        behind = moves & (pace > 0)
-        lag = jnp.where(
-            behind, self.friction * x * turns / jnp.where(behind, pace, 1.0), 0.0
-        )
-        return turned((first, perpendicular_to(first)), -lag)[0]
+        dx = quotient(const.frozen.closing * g, unit, where=unit > 0)
+        pace = self.aim(y) + mu * dx  # mu (A + x')
+        lag = quotient(mu * x * dphi, pace, where=moves & (pace > 0))
+        direction, _ = turned((first, perpendicular_to(first)), -lag)
+        return direction
 
     def forces(  # type: ignore[override]
         self,
@@ -333,7 +325,7 @@ class SpringFlow(FrictionFlow):
         rate = jnp.where(holds[:, None], (frozen.unit * self.omega)[:, None] * u, 0.0)
         haste = jnp.ones_like(frozen.unit)
         if self.in_space:
-            slides = const.slides & (modes[2 * self.contacts :] == Slide.SLIDES)
+            slides = const.slides & (self.modes(modes).slip == Slide.SLIDES)
             turns = slides & (self.friction > 0) & (x > 0)
             depth = jnp.where(turns, self.friction * x, 1.0)
             swift = jnp.where(turns, self.steep * frozen.unit * self.omega / depth, 0.0)
@@ -352,19 +344,16 @@ class SpringFlow(FrictionFlow):
         """
         frozen = const.frozen
         forces = self.forces(const, modes, y)
+        f = forces.normal
         side = forces.side
-        pull = self.coupling.times(forces.normal) + times(self.normal_tangent, side)
-        along = self.slip_acceleration(forces.normal, side)
-        rates = [
-            frozen.closing * self.rows(y)[1],
-            frozen.ratio * pull,
-            frozen.unit * forces.normal,
-            frozen.unit * along,
-            forces.elongation.reshape(side.shape),
-            frozen.unit * side,
-            frozen.unit,
-        ]
-        dy = jnp.concatenate(rates)
+        dx = frozen.closing * self.rows(y).g
+        pull = self.coupling.times(f) + times(self.normal_tangent, side)
+        dg = frozen.ratio * pull
+        dp = frozen.unit * f
+        du = frozen.unit * self.slip_acceleration(f, side)
+        dxi = forces.elongation.reshape(side.shape)
+        dside = frozen.unit * side
+        dy = jnp.concatenate([dx, dg, dp, du, dxi, dside, frozen.unit])
         if self.in_space:
             return dy / forces.haste
         return dy
@@ -377,34 +366,30 @@ class SpringFlow(FrictionFlow):
 
         In space the last ones are also those between sliding and dragging.
 
+        slip ends   `slip / (mu + kappa eta)`, the slip rate, see `forces`
+        gives way   `(mu x - kappa eta |xi|) / (mu + kappa eta)` + BEYOND tolerance
+        drags       `x - A / swift`: A / x rises to `swift`
+        slides on   of one that drags `4 A / swift - x`: A / x falls to a quarter of it
 
-        slip ends   `kappa eta n . u - mu c gamma`-like: the slip rate, see `forces`
-        gives way   `mu x - kappa eta |xi|`, and BEYOND of the tolerance
-        drags       `A / x` is below `swift`, or, of one that drags, above a quarter of
-        it
-
-        The first two over `mu + kappa eta`; 1 where there is no such end.
+        1 where there is no such end.
         """
         mu = self.friction
         steep = self.steep
         x, *_ = self.rows(y)
         slip = self.forces(const, modes, y).slip
         ends = const.slides & (mu > 0)
-        room = (mu * x - steep * self.elongation(y)) / (
-            mu + steep
-        ) + BEYOND * self.tolerance
+        room = (mu * x - steep * self.elongation(y)) / (mu + steep)
+        room = room + BEYOND * self.tolerance
         room = jnp.where(const.loaded & ~const.slides, room, 1.0)
         if self.in_space:
             rubs = jnp.where(mu > 0, mu, 1.0)
-            least = self.aim(y) / (self.swift * rubs)  # x below which it drags
-            drags = modes[2 * self.contacts :] == Slide.DRAGS
-            room = jnp.where(
-                ends, jnp.where(drags, least / QUARTER - x, x - least), room
-            )
+            shallow = self.aim(y) / (self.swift * rubs)  # A / swift
+            drags = self.modes(modes).slip == Slide.DRAGS
+            between = jnp.where(drags, shallow / QUARTER - x, x - shallow)
+            room = jnp.where(ends, between, room)
         normal = self.normal_margins(const.frozen, modes, y)
-        return jnp.concatenate(
-            [normal, jnp.where(ends, slip / (mu + steep), 1.0), room]
-        )
+        stops = jnp.where(ends, slip / (mu + steep), 1.0)
+        return jnp.concatenate([normal, stops, room])
 
     def switch(
         self,
@@ -418,28 +403,26 @@ class SpringFlow(FrictionFlow):
         Slip ends with the spring on its cone, xi = mu x / (kappa eta) n; a contact that
         opens has xi = 0.
         """
-        m = self.contacts
-        stopped = which[2 * m : 3 * m]
-        ended = which[3 * m :]
+        _, _, stopped, ended = self.kinds(which)
         const = self.constants(modes)
         xi = self.spring(y)
-        slip = modes[2 * m :]
+        slip = self.modes(modes).slip
         n = self.forces(const, modes, y).direction
-        ends_slide = const.slides & ended  # in space: it drags from now on, or no more
         direction = jnp.where(const.slides[:, None], n, xi)
-        cone = (self.friction * self.rows(y)[0] / self.steep)[:, None] * n
+        cone = (self.friction * self.rows(y).x / self.steep)[:, None] * n
         xi = jnp.where(stopped[:, None], cone, xi)
+        # in space one that slides drags from now on, one that drags slides
+        other = Slide.SLIDES + Slide.DRAGS - slip
         xi, slip = self.sliding_from(ended, direction, y, slip, xi)
-        other = Slide.SLIDES + Slide.DRAGS - modes[2 * m :]
-        slip = jnp.where(stopped, 0, jnp.where(ends_slide, other, slip))
-        after, y = self.normal_switch(modes, y, which[: 2 * m])
+        slip = jnp.where(const.slides & ended, other, slip)
+        slip = jnp.where(stopped, Slide.HOLDS, slip)
+        after, y = self.normal_switch(modes, y, which)
         remains = self.loaded(after)
-        slip = jnp.where(remains, slip, 0)
+        slip = jnp.where(remains, slip, Slide.HOLDS)
         xi = jnp.where(remains[:, None], xi, 0.0)
-        after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
-        return self.closed(
-            after, self.with_spring(y, xi), remains & ~self.loaded(modes)
-        )
+        after = self.with_slip_modes(after, slip)
+        closed = remains & ~self.loaded(modes)
+        return self.closed(after, self.with_spring(y, xi), closed)
 
     def sliding_from(
         self,
@@ -451,14 +434,18 @@ class SpringFlow(FrictionFlow):
     ) -> tuple[Float[Array, "m b B"], Int[Array, "m B"]]:
         """Rows of xi and modes of slip where the contacts `which` slide in these
         directions.
+
+        In the plane xi stays, and the mode is the sign of the direction. In space the
+        rows of xi become 0 and the angle; a contact whose A / x is above half of
+        `swift` drags.
         """
         if not self.in_space:
-            return xi, jnp.where(
-                which, jnp.sign(direction[:, 0]).astype(slip.dtype), slip
-            )
+            sign = jnp.sign(direction[:, 0]).astype(slip.dtype)
+            return xi, jnp.where(which, sign, slip)
         angle = angle_of(jnp.where(which[:, None], direction, 0.0))
         rows = jnp.stack([jnp.zeros_like(angle), angle], 1)
-        swift = self.aim(y) > 2 * QUARTER * self.swift * self.friction * self.rows(y)[0]
+        half = 2 * QUARTER * self.swift
+        swift = self.aim(y) > half * self.friction * self.rows(y).x
         mode = jnp.where(swift, Slide.DRAGS, Slide.SLIDES)
         return jnp.where(which[:, None], rows, xi), jnp.where(which, mode, slip)
 
@@ -469,19 +456,18 @@ class SpringFlow(FrictionFlow):
         which: Bool[Array, "m B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state where the contacts `which` have closed: they hold, or slide
-        at once.
+        at once, where they have slip and no friction, or a spring that leaves the cone.
 
         At x = 0 the cone widens at the rate mu |gamma|, the spring at kappa eta |u|.
         """
-        m = self.contacts
         x, g, _ = self.rows(y)
         u = self.by_contact(self.slip(y))
         speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(u) ** 2, axis=1))
         faster = self.steep * speed > self.friction * jnp.abs(g)
         at_once = which & (speed > 0) & ((faster & (x <= 0)) | (self.friction <= 0))
-        xi, slip = self.sliding_from(at_once, u, y, modes[2 * m :], self.spring(y))
-        modes = jnp.concatenate([modes[: 2 * m], slip.astype(modes.dtype)])
-        return modes, self.with_spring(y, xi)
+        slip = self.modes(modes).slip
+        xi, slip = self.sliding_from(at_once, u, y, slip, self.spring(y))
+        return self.with_slip_modes(modes, slip), self.with_spring(y, xi)
 
     def contact_states(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
@@ -490,17 +476,15 @@ class SpringFlow(FrictionFlow):
         const = self.constants(modes)
         forces = self.forces(const, modes, y)
         states = ContactFlow.contact_states(self, modes, y)
-        t = self.normal_tangent.shape[1]
         square = jnp.sum(self.by_contact(forces.side) ** 2, axis=1)
-        # twice the energy, omega k_t xi^2 over omega^2: lambda^2 x / (kappa eta omega
-        # F)
+        # twice the energy, omega k_t xi^2 over omega^2:
+        # lambda^2 x / (kappa eta omega F)
         stiffness = self.steep * self.omega * forces.normal
-        some = stiffness > 0
-        depth = jnp.maximum(self.rows(y)[0], 0.0)
-        energy = jnp.where(some, square * depth / jnp.where(some, stiffness, 1.0), 0.0)
+        depth = jnp.maximum(self.rows(y).x, 0.0)
+        energy = quotient(square * depth, stiffness, where=stiffness > 0)
         return states._replace(
             tangential_force=forces.side,
-            tangential_impulse=y[-1 - t : -1],
+            tangential_impulse=self.side_impulse(y),
             slip=self.slip(y),
             tangential_energy=energy,
             rate=const.frozen.unit / forces.haste,

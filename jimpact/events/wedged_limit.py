@@ -21,13 +21,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jimpact.events import plastic_limit
-from jimpact.events.contact_flow import PATIENCE, WIDENED
+from jimpact.events.contact_flow import PATIENCE, WIDENED, largest_of
 from jimpact.events.friction_flow import Cycle
 from jimpact.events.run import Rest
 from jimpact.numerics.dense import times
 from jimpact.numerics.stepper import Mark, StepperState, any_of
 from jimpact.numerics.tangents import value_of
 from jimpact.tools.loops import cond
+from jimpact.tools.masks import choose, quotient
 
 # Difference between a state and a multiple s of an earlier one, as a part of 1 - s. Ten
 # times more: transients are taken for cycles, and slip that goes on for slip that ends;
@@ -56,26 +57,30 @@ def inspect(
     if at_end:
         end = plastic_limit.inspect(flow, gamma, carry, rest, which, at_end)
         return end._replace(contacts=end.contacts | rest.cycle.wedged)
-    which = which | dragged_on(value_of(flow), carry, rest)
-    values = carry._replace(y=value_of(carry.y))
-    constant, values = jax.lax.stop_gradient((value_of(flow), values))
+    values = value_of(flow), carry._replace(y=value_of(carry.y))
+    flow, carry = jax.lax.stop_gradient(values)
+    which = which | dragged_on(flow, carry, rest)
     return cond(
-        jnp.any(which), lambda: returned(constant, values, rest, which), lambda: rest
+        jnp.any(which), lambda: returned(flow, carry, rest, which), lambda: rest
     )
 
 
 def cycle_at(flow: Any, carry: StepperState) -> Cycle:
     """The state of the impact now, as that of a cycle."""
     modes = carry.step.modes
-    state = carry.y
-    x, g, p = flow.rows(state)
-    none = jnp.zeros_like(x)
-    gamma = flow.scales(modes) * g
-    root = jnp.sqrt(flow.energy(x, none))
-    slip = flow.slip(state)
-    side = flow.side_impulse(state)
+    x, g, p = flow.rows(carry.y)
     no = jnp.zeros(x.shape, bool)
-    return Cycle(modes, carry.passes, gamma, root, slip, p, side, no, no)
+    return Cycle(
+        modes=modes,
+        passes=carry.passes,
+        gamma=flow.scales(modes) * g,
+        root=jnp.sqrt(flow.energy(x, jnp.zeros_like(x))),
+        slip=flow.slip(carry.y),
+        impulse=p,
+        side=flow.side_impulse(carry.y),
+        wedged=no,
+        stops=no,
+    )
 
 
 def returned(
@@ -90,14 +95,9 @@ def returned(
     found, ended = compared(flow, now, rest.cycle, dragged_on(flow, carry, rest))
     ended = which & ended
     due = which & ~ended & (now.passes >= 2 * rest.cycle.passes)
-    cycle = _choose(due, now, rest.cycle)
-    cycle = _choose(ended, found, cycle)
+    cycle = choose(due, now, rest.cycle)
+    cycle = choose(ended, found, cycle)
     return rest._replace(cycle=cycle, ended=rest.ended | ended)
-
-
-def _choose(which: Bool[Array, "1 B"], new: Cycle, old: Cycle) -> Cycle:
-    """The `new` cycle in the impacts `which`, the `old` one in others."""
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
 
 def dragged_on(flow: Any, carry: StepperState, rest: Rest) -> Bool[Array, "1 B"]:
@@ -107,45 +107,45 @@ def dragged_on(flow: Any, carry: StepperState, rest: Rest) -> Bool[Array, "1 B"]
 
 
 def compared(
-    flow: Any, now: Cycle, kept: Cycle, drags: Bool[Array, "1 B"]
+    flow: Any, now: Cycle, old: Cycle, drags: Bool[Array, "1 B"]
 ) -> tuple[Cycle, Bool[Array, "1 B"]]:
-    """What is left if the state `now` is a multiple of the one `kept`; a mask: it is.
+    """What is left if the state `now` is a multiple s of the `old` one; a mask: it is.
 
-    Contacts that have carried an impulse since are wedged. The others must be open and
-    remain so, and slip that does not stop must keep its direction, to the end. In
-    impacts that have dragged on, `drags`, the course that decays is no cycle: there all
-    that is within the widened tolerance stops, and slip that has fallen by half.
+    Contacts that have carried an impulse p since are wedged, and carry `p s / (1 - s)`
+    from now on. The others must be open and remain so, and slip that does not stop must
+    keep its direction, to the end. In impacts that have dragged on, `drags`, the course
+    that decays is no cycle: there all that is within the widened tolerance stops, and
+    slip that has fallen by half.
     """
-    m = flow.contacts
-    impulse = now.impulse - kept.impulse
-    side = now.side - kept.side
+    impulse = now.impulse - old.impulse
+    side = now.side - old.side
     wedged = impulse > 0
     size = _size(now, wedged)
-    before = _size(kept, wedged)
-    ratio = size / jnp.where(before > 0, before, size)
-    decays = (ratio < 1) & (before > 0) & (kept.passes > 0)
+    old_size = _size(old, wedged)
+    ratio = size / jnp.where(old_size > 0, old_size, size)  # s
+    decays = (ratio < 1) & (old_size > 0) & (old.passes > 0)
     allowed = RETURNED * (1 - ratio) * size
     allowed = jnp.where(drags, WIDENED * flow.tolerance, allowed)
     expected = jnp.where(drags, 0.0, ratio)  # of what was
-    multiple = jnp.abs(now.gamma - expected * kept.gamma) <= allowed
-    multiple = multiple & (jnp.abs(now.root - expected * kept.root) <= allowed)
-    differs = jnp.abs(now.slip - expected * kept.slip)
-    falls = drags & (jnp.abs(now.slip) <= jnp.abs(kept.slip) / 2)
+    multiple = jnp.abs(now.gamma - expected * old.gamma) <= allowed
+    multiple = multiple & (jnp.abs(now.root - expected * old.root) <= allowed)
+    differs = jnp.abs(now.slip - expected * old.slip)
+    falls = drags & (jnp.abs(now.slip) <= jnp.abs(old.slip) / 2)
     stops = wedged & ((differs <= allowed) | falls)
     # the sum of what is left, a geometric series
-    series = jnp.where(decays, ratio / jnp.where(decays, 1 - ratio, 1.0), 0.0)
+    series = quotient(ratio, 1 - ratio, where=decays)
     left = series * impulse
     left_side = series * side
-    pull = flow.coupling.times(left) + times(flow.normal_tangent, left_side)
-    drag = times(jnp.swapaxes(flow.normal_tangent, 0, 1), left)
-    drag = drag + times(flow.tangent, left_side)
-    is_open = (now.gamma >= 0) & (now.gamma + pull >= 0) & (now.root <= 0)
+    dgamma = flow.coupling.times(left) + times(flow.normal_tangent, left_side)
+    du = times(jnp.swapaxes(flow.normal_tangent, 0, 1), left)
+    du = du + times(flow.tangent, left_side)
+    is_open = (now.gamma >= 0) & (now.gamma + dgamma >= 0) & (now.root <= 0)
     clear = drags | (differs > CLEARLY * allowed)
-    goes_on = (now.slip * (now.slip + drag) > 0) & clear
+    goes_on = (now.slip * (now.slip + du) > 0) & clear
     meets = jnp.where(wedged, multiple & (stops | goes_on), is_open)
-    # phases and slip, without how often each contact has closed
-    counts = jnp.arange(len(now.modes)) // m == 1
-    changed = (now.modes != kept.modes) & ~counts[:, None]
+    modes = flow.modes(now.modes)
+    old_modes = flow.modes(old.modes)
+    changed = (modes.phase != old_modes.phase) | (modes.slip != old_modes.slip)
     same = drags | ~any_of(changed)
     ended = decays & any_of(wedged) & ~any_of(~meets) & same
     found = now._replace(impulse=left, side=left_side, wedged=wedged, stops=stops)
@@ -155,4 +155,4 @@ def compared(
 def _size(state: Cycle, wedged: Bool[Array, "m B"]) -> Float[Array, "1 B"]:
     """Largest velocity, or root of an energy, of the contacts that are `wedged`."""
     largest = jnp.maximum(jnp.abs(state.gamma), state.root)
-    return jnp.max(jnp.where(wedged, largest, 0.0), axis=0, keepdims=True)
+    return largest_of(jnp.where(wedged, largest, 0.0))

@@ -27,6 +27,11 @@ from jimpact.tools.compiling import full_precision, precise_jit
 ORDERS = ("fastest", "earliest", "left_to_right")
 
 
+def _is_index(j: Any) -> bool:
+    """True for a whole number >= 0, which is no truth value."""
+    return not isinstance(j, bool) and hasattr(j, "__index__") and j >= 0
+
+
 def _checked_order(order: Any) -> str | tuple[int, ...]:
     """`order` as a name or a tuple of ints; raise a ValueError for any other value."""
     if isinstance(order, str) and order in ORDERS:
@@ -36,10 +41,7 @@ def _checked_order(order: Any) -> str | tuple[int, ...]:
             f"Argument `order` must be one of {ORDERS} or a tuple of contact indices, "
             f"but has value {order!r}."
         )
-    bad = [
-        j for j in order if isinstance(j, bool) or not hasattr(j, "__index__") or j < 0
-    ]
-    if bad:
+    if not all(_is_index(j) for j in order):
         raise ValueError(
             f"Argument `order` must hold contact indices >= 0, but has value {order!r}."
         )
@@ -146,9 +148,10 @@ class Binary(Law):
                 f"is missing "
                 f"in {self.order!r} and could approach forever."
             )
-        if m > 1 and any(
-            a == b for a, b in zip(self.order, self.order[1:] + self.order[:1])
-        ):
+        first, *others = self.order
+        following = (*others, first)
+        twice = any(j == k for j, k in zip(self.order, following))
+        if m > 1 and twice:
             raise ValueError(
                 "Argument `order` must not name a contact twice in a row (the last and "
                 "the first "
@@ -201,12 +204,14 @@ class Binary(Law):
         collisions.
         """
         gamma = contact.gap_velocity
+        gaps = self._gaps(contact.gaps, gamma)
+        cycle = self._cycle(gamma.shape[0])
         return collisions.solve(
             contact.delassus,
             gamma,
             self.restitution,
-            self._gaps(contact.gaps, gamma),
-            self._cycle(gamma.shape[0]),
+            gaps,
+            cycle,
             self.max_collisions,
             self._friction(contact),
         )
@@ -254,30 +259,27 @@ class Binary(Law):
         w = contact.delassus
         gamma = contact.gap_velocity
         gaps = law._gaps(contact.gaps, gamma)
-        inputs = collisions.to_inputs(
-            w, gamma, law.restitution, gaps, law._friction(contact)
-        )
-        cycle = law._cycle(scene.contacts)
+        friction = law._friction(contact)
+        inputs = collisions.to_inputs(w, gamma, law.restitution, gaps, friction)
         options = collisions.Options(
-            cycle, self.max_collisions, isinstance(w, Tridiagonal)
+            cycle=law._cycle(scene.contacts),
+            max_collisions=self.max_collisions,
+            chain=isinstance(w, Tridiagonal),
         )
         g = collisions.coupling_matrix(inputs, options)
-        at = collisions.begin(inputs)
+        now = collisions.begin(inputs)
         steps: list[tuple[int, float | None, np.ndarray]] = []
-        while len(steps) < min(limit, self.max_collisions) and collisions.approaches(
-            inputs, at
-        ):
-            before = at
-            at = _collide(inputs, options, g, at)
-            j = int(jnp.argmax(at.p - before.p))  # only this contact gained an impulse
+        limit = min(limit, self.max_collisions)
+        while len(steps) < limit and collisions.approaches(inputs, now):
+            after = _collide(inputs, options, g, now)
+            j = int(jnp.argmax(after.p - now.p))  # only this contact gained an impulse
+            time = None
             if law.order == "earliest":
-                time = float(at.time)
-            else:
-                time = None
-            p, tangential = collisions.impulses_of(at.p, at.tangential, inputs.root)
-            steps.append(
-                (j, time, np.asarray(v + velocity_change(scene, p, tangential)))
-            )
+                time = float(after.time)
+            p, p_t = collisions.impulses_of(after.p, after.tangential, inputs.root)
+            velocity = v + velocity_change(scene, p, p_t)
+            steps.append((j, time, np.asarray(velocity)))
+            now = after
         return steps
 
     def _prepared(
@@ -297,7 +299,8 @@ class Binary(Law):
 @precise_jit
 def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
     """Number of collisions () int32; -1: endless."""
-    return law._solve(law.contact(scene, velocity))[2].number
+    _, _, end = law._solve(law.contact(scene, velocity))
+    return end.number
 
 
 _collide = precise_jit(collisions.collide)

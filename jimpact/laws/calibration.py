@@ -79,10 +79,13 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
         failed = status != CODE["ok"]
         if not failed.any():
             return restitution
-        coarse, status_coarse = _each(_bounce, force, m, v, jnp.asarray(rtol, v.dtype))
+        coarser = jnp.asarray(rtol, v.dtype)
+        coarse, status_coarse = _each(_bounce, force, m, v, coarser)
         restitution = jnp.where(failed, coarse, restitution)
         status = jnp.where(failed, status_coarse, status)
-    if reasons := {STATUS[code].name for code in status.ravel().tolist() if code}:
+    codes = set(status.ravel().tolist()) - {CODE["ok"]}
+    if codes:
+        reasons = {STATUS[code].name for code in codes}
         warnings.warn(
             f"The impact of a pair ends with {', '.join(reasons)}.", stacklevel=2
         )
@@ -92,9 +95,9 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
 def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
     """The same force with the damping that gives a pair the requested restitution.
 
-    Solves `measured_restitution(force', mass, speed) =
-    restitution` for the damping; a `Bistiffness` takes the coefficient as it is.
-    Differentiable in all arguments, by the implicit function theorem.
+    Solves `measured_restitution(force', mass, speed) = restitution` for the damping; a
+    `Bistiffness` takes the coefficient as it is. Differentiable in all arguments, by
+    the implicit function theorem.
 
     Args:
         force: `KelvinVoigt`, `HuntCrossley`, `KuwabaraKono` or `Bistiffness`; its own
@@ -157,19 +160,20 @@ def _each(
     arrays = eqx.filter(force, eqx.is_array)
     if isinstance(force, UserForce):
         arrays = None
-    shapes = [leaf.shape for leaf in jax.tree.leaves(arrays)]
-    shape = jnp.broadcast_shapes(*shapes, *(jnp.shape(value) for value in values))
+    leaves = jax.tree.leaves((arrays, values))
+    shape = jnp.broadcast_shapes(*(jnp.shape(leaf) for leaf in leaves))
     flat = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, shape).ravel(), (arrays, values)
     )
-    if arrays is None:
-        fixed = force
-    else:
+    fixed = force
+    if arrays is not None:
         fixed = eqx.filter(force, eqx.is_array, inverse=True)
-    run = jax.vmap(
-        lambda leaves, scalars: function(eqx.combine(leaves, fixed), *scalars)
-    )
-    return tuple(result.reshape(shape) for result in run(*flat))
+
+    def of_one(arrays: Any, scalars: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """The function of one entry."""
+        return function(eqx.combine(arrays, fixed), *scalars)
+
+    return tuple(result.reshape(shape) for result in jax.vmap(of_one)(*flat))
 
 
 def _integrated(
@@ -180,7 +184,8 @@ def _integrated(
 
     Equation: `e = -v+ / v-`; NaN where the impact has no end.
     """
-    return _bounce(force, mass, speed, RTOL.get(str(jnp.result_type(mass, speed))))
+    dtype = str(jnp.result_type(mass, speed))
+    return _bounce(force, mass, speed, RTOL.get(dtype))
 
 
 def _bounce(
@@ -191,9 +196,11 @@ def _bounce(
     e is NaN where the impact has no end. `rtol` None: the default tolerance of the law.
     """
     law = Compliant(force)
-    out = impact(law, chain(mass[None], wall=True), speed[None], rtol=rtol)
+    scene = chain(mass[None], wall=True)
+    out = impact(law, scene, speed[None], rtol=rtol)
     ended = out.status == CODE["ok"]
-    return jnp.where(ended, -out.velocity[0] / speed, jnp.nan), out.status
+    e = -out.velocity[0] / speed
+    return jnp.where(ended, e, jnp.nan), out.status
 
 
 def _damping(
@@ -243,4 +250,5 @@ def _damping(
 
     s = jax.lax.custom_root(excess, jnp.zeros_like(e), bisected, scalar_solve)
     reached = s < STRONGEST * (1 - END)
-    return (jnp.where(reached, scale * s / (1 - s), jnp.nan),)
+    damping = jnp.where(reached, scale * s / (1 - s), jnp.nan)
+    return (damping,)

@@ -2,12 +2,10 @@
 
 Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(W_jj) p`
 and G with unit diagonal. A collision at contact j adds `pbar_j += s_j` and
-`qn += G_j s_j`, with
-`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`. With friction
-it adds a tangential impulse, too: each collision is one contact's Coulomb problem
-(`friction.py`).
-With correlation ratios the closed contacts beside it get impulses in a given ratio to
-its own.
+`qn += G_j s_j`, with `s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes
+`-e_j qn_j`. With friction it adds a tangential impulse, too: each collision is one
+contact's Coulomb problem (`friction.py`). With correlation ratios the closed contacts
+beside it get impulses in a given ratio to its own.
 """
 
 from typing import NamedTuple
@@ -134,9 +132,8 @@ def solve(
 
     Differentiable in both modes.
     """
-    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(
-        ratio=ratio
-    )
+    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)
+    inputs = inputs._replace(ratio=ratio)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
     (p, tangential), end = by_jacobian(lambda problem: run(problem, options), inputs)
     return *impulses_of(p, tangential, jnp.sqrt(diagonal(delassus))), end
@@ -166,17 +163,19 @@ def to_inputs(
     """
     root = jnp.sqrt(diagonal(delassus))
     g = scaled(delassus, 1 / root)
-    coupling = off_diagonal(g if isinstance(g, Tridiagonal) else as_matrix(g))
-    fixed = jax.lax.stop_gradient
+    if not isinstance(g, Tridiagonal):
+        g = as_matrix(g)
     if friction is not None:
         friction = friction._replace(block=friction.block.scaled(root))
+    if gaps is not None:
+        gaps = jax.lax.stop_gradient(gaps)
     return Inputs(
-        coupling,
-        restitution,
-        gamma / root,
-        fixed(root),
-        None if gaps is None else fixed(gaps),
-        friction,
+        coupling=off_diagonal(g),
+        restitution=restitution,
+        qn=gamma / root,
+        root=jax.lax.stop_gradient(root),
+        gaps=gaps,
+        friction=friction,
     )
 
 
@@ -191,7 +190,8 @@ def run(
     """
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
-    pair = inputs.qn.shape[0] == 2 and inputs.friction is None and inputs.ratio is None
+    alone = inputs.friction is None and inputs.ratio is None
+    pair = inputs.qn.shape[0] == 2 and alone
     endless = jnp.array(False)
     limit = start.p
     if pair:
@@ -199,26 +199,28 @@ def run(
         endless, limit = endless_pair(inputs, first)
         endless = endless & approaches(inputs, start)
 
-    def unfinished(at: CollisionState) -> jax.Array:
+    def unfinished(now: CollisionState) -> jax.Array:
         """True () if another collision follows, and the largest number is not
         reached.
         """
-        return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
+        left = now.number < options.max_collisions
+        return ~endless & approaches(inputs, now) & left
 
-    end = while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
+    end = while_loop(unfinished, lambda now: collide(inputs, options, g, now), start)
     stopped = ~endless & approaches(inputs, end)
     if not pair:
-        slow = end.speed < DECAYED.get(str(end.qn.dtype), 3e-4) * scale_of(inputs)
+        decayed = DECAYED.get(str(end.qn.dtype), 3e-4)
+        slow = end.speed < decayed * scale_of(inputs)
         endless = slow & jnp.any(end.qn < 0) & ~stopped
     code = jnp.where(end.tied, CODE["order_dependent"], CODE["ok"])
     code = jnp.maximum(code, end.code)
     code = jnp.where(endless, CODE["plastic_limit"], code)
     code = jnp.where(stopped, CODE["max_steps"], code)
+    p = end.p
     if pair:
-        p = jnp.where(endless, limit, end.p)
-    else:
-        p = end.p
-    return (p, end.tangential), SequenceEnd(code, jnp.where(endless, -1, end.number))
+        p = jnp.where(endless, limit, p)
+    number = jnp.where(endless, -1, end.number)
+    return (p, end.tangential), SequenceEnd(code, number)
 
 
 def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
@@ -230,7 +232,8 @@ def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
     if options.chain:
         return Tridiagonal(jnp.ones(m, dtype), inputs.coupling)
     i, j = jnp.triu_indices(m, 1)
-    upper = jnp.zeros((m, m), dtype).at[i, j].set(inputs.coupling)
+    zero = jnp.zeros((m, m), dtype)
+    upper = zero.at[i, j].set(inputs.coupling)
     return jnp.eye(m, dtype=dtype) + upper + upper.T
 
 
@@ -244,15 +247,20 @@ def rest_of(inputs: Inputs) -> jax.Array:
     return REST * precision(inputs.qn.dtype).eps * scale_of(inputs)
 
 
-def approaches(inputs: Inputs, at: CollisionState) -> jax.Array:
+def approaches(inputs: Inputs, now: CollisionState) -> jax.Array:
     """True () if a contact approaches by more than rounding."""
-    return jnp.any(at.qn < -rest_of(inputs))
+    return jnp.any(now.qn < -rest_of(inputs))
 
 
 def begin(inputs: Inputs) -> CollisionState:
     """State before the first collision."""
     dtype = inputs.qn.dtype
     zero = jnp.array(0, jnp.int32)
+    slip = None
+    tangential = None
+    if inputs.friction is not None:
+        slip = inputs.friction.block.slip
+        tangential = jnp.zeros_like(slip)
     return CollisionState(
         qn=inputs.qn,
         p=jnp.zeros_like(inputs.qn),
@@ -262,16 +270,14 @@ def begin(inputs: Inputs) -> CollisionState:
         tied=jnp.array(False),
         gaps=inputs.gaps,
         time=jnp.array(0, dtype),
-        slip=None if inputs.friction is None else inputs.friction.block.slip,
-        tangential=None
-        if inputs.friction is None
-        else jnp.zeros_like(inputs.friction.block.slip),
+        slip=slip,
+        tangential=tangential,
         code=jnp.array(CODE["ok"], jnp.int32),
     )
 
 
 def choose(
-    inputs: Inputs, options: Options, g: Symmetric, at: CollisionState
+    inputs: Inputs, options: Options, g: Symmetric, now: CollisionState
 ) -> NextCollision:
     """The contact that collides next, at a state with contacts that approach.
 
@@ -280,20 +286,14 @@ def choose(
     rounding, and `tied` if one of these is coupled with it (G_ij != 0).
     """
     rest = rest_of(inputs)
-    approaching = at.qn < -rest
+    approaching = now.qn < -rest
     if options.cycle is not None:
-        cycle = jnp.array(options.cycle, jnp.int32)
-        ready = approaching[cycle]  # entries whose contact approaches
-        ahead = ready & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
-        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(ready)).astype(
-            jnp.int32
-        )
-        return NextCollision(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
-    speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
+        return next_in_cycle(options.cycle, approaching, now)
+    speed = jnp.where(approaching, -now.qn * inputs.root, 0.0)  # m/s
     rivals = approaching
     wait = jnp.zeros_like(speed)
-    if at.gaps is not None:
-        rivals, wait = first_to_close(inputs, at, approaching, speed)
+    if now.gaps is not None:
+        rivals, wait = first_to_close(inputs, now, approaching, speed)
     noise = rest * inputs.root
     fastest = jnp.max(jnp.where(rivals, speed - noise, -jnp.inf))
     equally_fast = rivals & (speed + noise >= fastest)
@@ -301,27 +301,44 @@ def choose(
     chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
     floor = precision(speed.dtype).noise
     coupled = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
-    if at.gaps is not None:
+    equals = equally_fast
+    if now.gaps is not None:
         equals = rivals
-    else:
-        equals = equally_fast
-    return NextCollision(j, at.place, wait[j], jnp.any(equals & coupled & ~chosen))
+    tied = jnp.any(equals & coupled & ~chosen)
+    return NextCollision(j, now.place, wait[j], tied)
+
+
+def next_in_cycle(
+    cycle: tuple[int, ...], approaching: jax.Array, now: CollisionState
+) -> NextCollision:
+    """The first contact `approaching` (m,) from entry `now.place` of the cycle on, else
+    from its begin.
+    """
+    contacts = jnp.array(cycle, jnp.int32)
+    entries = jnp.arange(len(cycle), dtype=jnp.int32)
+    ready = approaching[contacts]
+    ahead = ready & (entries >= now.place)
+    k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(ready))
+    k = k.astype(jnp.int32)
+    no_wait = jnp.zeros_like(now.time)
+    return NextCollision(contacts[k], k + 1, no_wait, tied=jnp.array(False))
 
 
 def first_to_close(
-    inputs: Inputs, at: CollisionState, approaching: jax.Array, speed: jax.Array
+    inputs: Inputs, now: CollisionState, approaching: jax.Array, speed: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """True (m,) for the contacts that close first, within rounding, and times (m,) [s]
     until then.
 
     Equation: `t_j = gap_j / speed_j`, infinite for contacts that do not approach.
     """
-    assert at.gaps is not None
+    assert now.gaps is not None
     assert inputs.gaps is not None
     safe = jnp.where(approaching, speed, 1.0)
-    wait = jnp.where(approaching, at.gaps / safe, jnp.inf)
+    wait = jnp.where(approaching, now.gaps / safe, jnp.inf)
     first = jnp.min(wait)
-    rounding = precision(speed.dtype).noise * (at.time + first + inputs.gaps / safe)
+    time = now.time + first + inputs.gaps / safe
+    rounding = precision(speed.dtype).noise * time
     return approaching & (wait <= first + rounding), wait
 
 
@@ -333,7 +350,7 @@ def times(g: Symmetric, vector: jax.Array) -> jax.Array:
 
 
 def collide(
-    inputs: Inputs, options: Options, g: Symmetric, at: CollisionState
+    inputs: Inputs, options: Options, g: Symmetric, now: CollisionState
 ) -> CollisionState:
     """State after the free flight to the next collision and this collision.
 
@@ -341,40 +358,42 @@ def collide(
     `qn += G_j s`; with friction or correlation ratios impulses of `_with_friction`,
     `_correlated`.
     """
-    choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
-    chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
-    slip = at.slip
-    tangential = at.tangential
-    code = at.code
+    choice = choose(inputs, options, g, jax.lax.stop_gradient(now))
+    qn = now.qn
+    chosen = jnp.arange(qn.shape[0], dtype=jnp.int32) == choice.contact
+    slip = now.slip
+    tangential = now.tangential
+    code = now.code
     if inputs.ratio is not None:
-        p, status = _correlated(inputs, inputs.ratio, g, at, chosen)
-        after = at.qn + times(g, p)
+        p, status = _correlated(inputs, inputs.ratio, g, now, chosen)
+        after = qn + times(g, p)
         code = jnp.maximum(code, status)
     elif inputs.friction is None:
-        p = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
-        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, p))
+        e = inputs.restitution
+        p = jnp.where(chosen, -(1 + e) * qn, 0.0)
+        after = jnp.where(chosen, -e * qn, qn + times(g, p))
     else:
         assert slip is not None
         assert tangential is not None
-        p, p_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
-        cross, tangent, _ = inputs.friction.block
-        after = at.qn + times(g, p) + cross @ p_t
-        slip = slip + cross.T @ p + tangent @ p_t
+        p, p_t, status = _with_friction(inputs, inputs.friction, now, choice.contact)
+        g_nt, g_tt, _ = inputs.friction.block
+        after = qn + times(g, p) + g_nt @ p_t
+        slip = slip + g_nt.T @ p + g_tt @ p_t
         tangential = tangential + p_t
         code = jnp.maximum(code, status)
-    gaps = at.gaps
+    gaps = now.gaps
     if gaps is not None:
-        flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
+        flown = gaps + jax.lax.stop_gradient(qn) * inputs.root * choice.wait
         gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
     return CollisionState(
         qn=after,
-        p=at.p + p,
-        number=at.number + jnp.array(1, jnp.int32),
+        p=now.p + p,
+        number=now.number + jnp.array(1, jnp.int32),
         place=choice.place,
-        speed=jax.lax.stop_gradient(-at.qn[choice.contact]),
-        tied=at.tied | choice.tied,
+        speed=jax.lax.stop_gradient(-qn[choice.contact]),
+        tied=now.tied | choice.tied,
         gaps=gaps,
-        time=at.time + choice.wait,
+        time=now.time + choice.wait,
         slip=slip,
         tangential=tangential,
         code=code,
@@ -385,49 +404,60 @@ def _correlated(
     inputs: Inputs,
     ratio: jax.Array,
     g: Symmetric,
-    at: CollisionState,
+    now: CollisionState,
     chosen: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Normalized impulses (m,) of a collision at the `chosen` contact and at those it
     presses.
 
     They grow in constant ratios, `pbar = s d`: d_i = 1 at the chosen contact i (True in
-    (m,)), `d_j = r_j sqrt(W_jj / W_ii)` beside it, r = `ratio`. With a = G d contact j
-    is compressed while `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
+    (m,)), `d_j = r_j sqrt(W_jj / W_ii)`, r = `ratio`, at contacts beside it that it
+    presses and that do not separate, 0 elsewhere. With a = G d contact j is compressed
+    while `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
     `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)` is that of kinetic energy:
     `d.a s^2 / 2 + d.qn s + L = 0`, and s is the larger root. The status is `infeasible`
-    where there is none, or a contact is left approaching; then the chosen contact
-    collides alone.
+    where there is none, a contact would be compressed for ever (a_j <= 0), or one is
+    left approaching. Then, or with none beside it, the chosen contact collides alone.
     """
-    noise = precision(at.qn.dtype).noise
-    own = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
+    qn = now.qn
+    e = inputs.restitution
+    rest = rest_of(inputs)
+    noise = precision(qn.dtype).noise
+    # pbar = s d
+    root_i = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
     if ratio.ndim == 2:
-        ratio = jnp.sum(jnp.where(chosen[:, None], ratio, 0.0), axis=0)
-    pressed = times(g, chosen.astype(at.qn.dtype)) < -noise
-    beside = pressed & (at.qn <= rest_of(inputs)) & ~chosen
-    d = jnp.where(chosen, 1.0, jnp.where(beside, ratio * inputs.root / own, 0.0))
+        of_i = jnp.where(chosen[:, None], ratio, 0.0)
+        ratio = jnp.sum(of_i, axis=0)
+    pressed = times(g, chosen.astype(qn.dtype)) < -noise
+    beside = pressed & (qn <= rest) & ~chosen
+    d = jnp.where(beside, ratio * inputs.root / root_i, 0.0)
+    d = jnp.where(chosen, 1.0, d)
     a = times(g, d)
-    closing = (d > 0) & (at.qn < 0)
+    # L
+    closing = (d > 0) & (qn < 0)
     stays = closing & (a <= 0)  # it would be compressed for ever
-    stored = jnp.where(
-        closing & ~stays, d * at.qn**2 / (2 * jnp.where(a > 0, a, 1.0)), 0.0
-    )
-    curvature = jnp.sum(d * a)
-    slope = -jnp.sum(d * at.qn)
-    square = slope**2 - 2 * curvature * jnp.sum((1 - inputs.restitution**2) * stored)
-    allowed = (square >= -noise * slope**2) & ~jnp.any(stays) & (curvature > 0)
+    work = d * qn**2 / (2 * jnp.where(a > 0, a, 1.0))
+    work = jnp.where(closing & ~stays, work, 0.0)
+    loss = jnp.sum((1 - e**2) * work)
+    # d.a s^2 / 2 + d.qn s + L = 0
+    da = jnp.sum(d * a)
+    slope = -jnp.sum(d * qn)
+    square = slope**2 - 2 * da * loss
+    allowed = (square >= -noise * slope**2) & ~jnp.any(stays) & (da > 0)
     real = allowed & (square > 0)
-    root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
-    s = (slope + root) / jnp.where(curvature > 0, curvature, 1.0)
-    left = at.qn + s * a
-    allowed = allowed & ~jnp.any(((d > 0) | beside) & (left < -rest_of(inputs)))
-    alone = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+    root = jnp.sqrt(jnp.where(real, square, 1.0))
+    root = jnp.where(real, root, 0.0)
+    s = (slope + root) / jnp.where(da > 0, da, 1.0)
+    takes_part = (d > 0) | beside
+    approaching = qn + s * a < -rest
+    allowed = allowed & ~jnp.any(takes_part & approaching)
+    alone = jnp.where(chosen, -(1 + e) * qn, 0.0)
     p = jnp.where(allowed & jnp.any(beside), s * d, alone)
     return p, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
 
 
 def _with_friction(
-    inputs: Inputs, friction: CoulombFriction, at: CollisionState, contact: jax.Array
+    inputs: Inputs, friction: CoulombFriction, now: CollisionState, contact: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Normalized impulses (m,), (t,) of a collision at one `contact` () with friction,
     and status.
@@ -435,23 +465,22 @@ def _with_friction(
     Equation: `qn+ = -e qn-` where this needs an impulse `p >= 0`, and
     `p_t in -mu p Sgn(u+ + e_t u-)`; impulses of other contacts are 0.
     """
+    assert now.slip is not None
     m, t = friction.block.normal_tangent.shape
-    each = t // m
-    rows = contact * each + jnp.arange(each, dtype=contact.dtype)  # its tangents
-    cross = friction.block.normal_tangent[contact, rows][None]
-    tangent = friction.block.tangent[rows[:, None], rows[None]]
-    matrix = jnp.block([[jnp.ones((1, 1), cross.dtype), cross], [cross.T, tangent]])
+    tangents = t // m
+    rows = contact * tangents + jnp.arange(tangents, dtype=contact.dtype)  # its own
+    g_nn = jnp.ones((1, 1), now.qn.dtype)
+    g_nt = friction.block.normal_tangent[contact, rows][None]
+    g_tt = friction.block.tangent[rows[:, None], rows[None]]
+    matrix = jnp.block([[g_nn, g_nt], [g_nt.T, g_tt]])
     e = jnp.broadcast_to(inputs.restitution, (m,))[contact]
-    assert at.slip is not None
-    impulses = solve_friction(
-        matrix,
-        ((1 + e) * at.qn[contact])[None],
-        (1 + friction.restitution[contact]) * at.slip[rows],
-        friction.coefficient[contact][None],
-        complementary=True,
-    )
-    p = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
-    p_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
+    e_t = friction.restitution[contact]
+    mu = friction.coefficient[contact]
+    b = (1 + e) * now.qn[contact]
+    b_t = (1 + e_t) * now.slip[rows]
+    impulses = solve_friction(matrix, b[None], b_t, mu[None], complementary=True)
+    p = jnp.zeros_like(now.qn).at[contact].set(impulses.normal[0])
+    p_t = jnp.zeros_like(now.slip).at[rows].set(impulses.tangential)
     return p, p_t, impulses.status
 
 
@@ -480,17 +509,21 @@ def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array
     trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
     ratio = c * (1 + e_k) * s_2 / s_1 - e_j  # s_3 / s_1
     chi = ratio**2 - trace * ratio + det
-    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + det))
-    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(det)))
+    rounding = noise * (ratio**2 + trace * ratio + det)
+    above = (ratio >= trace / 2) | (chi <= rounding)
+    root_det = jnp.sqrt(jax.lax.stop_gradient(det))
+    possible = (c > 0) & (trace >= 2 * root_det)
     endless = possible & (s_2 > 0) & (ratio >= 0) & above
     # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric
     # series
     det_g = 1 - c**2
     redundant = det_g <= noise
-    inverse = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, det_g)  # -G^-1 qn
+    regular = jnp.where(redundant, 1.0, det_g)
+    inverse = -(qn + c * jnp.flip(qn)) / regular  # -G^-1 qn
     decay = jnp.where(det < 1, 1 - det, 1.0)
     series_j = (1 + e_j) * s_1 / decay
     series_k = (1 + e_k) * s_2 / decay
     chosen = jnp.arange(2, dtype=jnp.int32) == first
-    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), inverse)
+    series = jnp.where(chosen, series_j, series_k)
+    p = jnp.where(redundant, series, inverse)
     return endless & ~(redundant & (det >= 1)), p

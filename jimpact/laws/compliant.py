@@ -16,6 +16,7 @@ from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,
+    ImpactUnits,
     dimensionless,
     solve,
     tangential_of,
@@ -28,6 +29,7 @@ from jimpact.laws.forces import (
     KuwabaraKono,
 )
 from jimpact.laws.lzb import (
+    BISTIFFNESS,
     check_few_contacts,
     check_spring,
     solver_of,
@@ -71,8 +73,7 @@ class Compliant(Law):
         adjoint: 'jacobian' (default), 'forward' or 'checkpoints', as in `LZB`.
 
     Status: `max_steps`; `plastic_limit` where contacts re-close without end;
-    `ill_conditioned`
-    if checked.
+    `ill_conditioned` if checked.
 
     Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-;
     one-sided where a gap is 0 and at grazing events; NaN as in `LZB`, and where a
@@ -160,7 +161,8 @@ class Compliant(Law):
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol`, or its default at this `contact`."""
-        return solver_of(self, contact)[1]
+        _, rtol = solver_of(self, contact)
+        return rtol
 
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dimensionless dynamics of the whole encounter, gaps included.
@@ -172,22 +174,18 @@ class Compliant(Law):
         """
         gamma = contact.gap_velocity
         force = self.force
-        viscous = None
         bistiffness = force.bistiffness
         if bistiffness is not None:
             k = bistiffness.stiffness
             e = bistiffness.restitution
             exponent = bistiffness.exponent
         else:
-            q = jnp.max(
-                jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus))
-            )
-            k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
-            k = jax.lax.stop_gradient(k)
+            k = stiffness_of_units(force, contact)
             e = jnp.ones_like(gamma)
             exponent = 1.0
         method, rtol = solver_of(self, contact)
         problem, units = dimensionless(
+            BISTIFFNESS,
             contact.delassus,
             gamma,
             e,
@@ -197,12 +195,9 @@ class Compliant(Law):
             rtol,
             contact.gaps,
         )
+        # F_j = max(f(x_j, x_j'), 0), called in SI units
         if bistiffness is None:
-            speed = units.velocity * units.root
-            depth = units.indentation
-            onset = jax.lax.stop_gradient(force.onset_scale(depth, speed))
-            viscous = Viscous(force, depth, speed, units.momentum / units.time, onset)
-        problem = problem._replace(viscous=viscous)
+            problem = problem._replace(viscous=viscous_force(force, units))
         # yields where k x^eta = F_y
         if bistiffness is not None and force.bound is not None:
             depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))
@@ -212,9 +207,16 @@ class Compliant(Law):
                 contact, self.friction, self.tangential_stiffness, units
             )
             problem = problem._replace(tangential=tangential)
-        structure = contact.structure
-        most = self.max_steps
-        return Dynamics(problem, units, exponent, structure, most, method, self.adjoint)
+        return Dynamics(
+            problem,
+            units,
+            BISTIFFNESS,
+            exponent,
+            contact.structure,
+            self.max_steps,
+            method,
+            self.adjoint,
+        )
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
@@ -226,6 +228,27 @@ class Compliant(Law):
         else:
             checked = None
         return Impulses(*solve(self.dynamics(contact), checked))
+
+
+def stiffness_of_units(force: Force, contact: Contact) -> jax.Array:
+    """k = q^2 / x^2 (m,) [N/m] of the spring that gives a viscous `force` its units.
+
+    It stores the energy q^2 / 2 of the fastest approach q [sqrt(J)] at the indentation
+    x [m] at which the force does, too (`indentation_scale`).
+    """
+    gamma = contact.gap_velocity
+    approach = jnp.where(gamma < 0, -gamma, 0.0)
+    q = jnp.max(approach / jnp.sqrt(diagonal(contact.delassus)))
+    x = force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))
+    return jax.lax.stop_gradient((q / x) ** 2)
+
+
+def viscous_force(force: Force, units: ImpactUnits) -> Viscous:
+    """A force F(x, x') with the units of x, x', F and of its onset."""
+    speed = units.velocity * units.root
+    depth = units.indentation
+    onset = jax.lax.stop_gradient(force.onset_scale(depth, speed))
+    return Viscous(force, depth, speed, units.momentum / units.time, onset)
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

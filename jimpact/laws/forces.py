@@ -70,9 +70,8 @@ class Force(Declared):
         """Largest `onset` at indentation `depth` (m,) [m], at rest and at `speed` (m,)
         [m/s].
         """
-        return jnp.maximum(
-            self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed)
-        )
+        at_rest = self.onset(depth, jnp.zeros_like(depth))
+        return jnp.maximum(at_rest, self.onset(depth, speed))
 
     @property
     def bistiffness(self) -> "Bistiffness | None":
@@ -123,9 +122,10 @@ class Force(Declared):
             """The half of the intervals (low, high) in which the excess changes
             sign.
             """
-            middle = 0.5 * (ends[0] + ends[1])
+            low, high = ends
+            middle = 0.5 * (low + high)
             above = excess(middle) > 0
-            return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])
+            return jnp.where(above, low, middle), jnp.where(above, middle, high)
 
         low, high = fori_loop(0, _BISECTIONS, halve, (low, high))
         return jax.lax.stop_gradient(10.0 ** (0.5 * (low + high)))
@@ -179,11 +179,10 @@ class ElastoPlastic(Force):
     """Elastic contact that yields: `F = k x^eta` up to a force that it never exceeds.
 
     Equation: `F = k x_e^eta` of the elastic indentation, `x_e' = -gamma`, but
-    `x_e' = 0` while
-    `F = F_y` and the contact is compressed. Unloading is elastic, along another branch,
-    to the residual indentation x - x_e, where the surface remains. A pair is elastic up
-    to a speed v_y; above it `e = v_y / v`, as it returns at most the elastic energy at
-    F_y,
+    `x_e' = 0` while `F = F_y` and the contact is compressed. Unloading is elastic,
+    along another branch, to the residual indentation x - x_e, where the surface
+    remains. A pair is elastic up to a speed v_y; above it `e = v_y / v`, as it returns
+    at most the elastic energy at F_y,
     `m v_y^2 / 2 = F_y^((eta + 1) / eta) / ((eta + 1) k^(1 / eta))`.
 
     A `Bistiffness`, in comparison, loses its share at any speed, and its force has no
@@ -232,12 +231,11 @@ class ElastoPlastic(Force):
         force.
         """
         eta = jnp.asarray(self.exponent, mass.dtype)
-        energy = (
-            self.yield_force ** ((eta + 1) / eta)
-            / (eta + 1)
-            / self.stiffness ** (1 / eta)
-        )
-        return jnp.minimum(1.0, jnp.sqrt(2 * energy / mass) / speed)
+        f_y = self.yield_force
+        k = self.stiffness
+        energy = f_y ** ((eta + 1) / eta) / (eta + 1) / k ** (1 / eta)
+        v_y = jnp.sqrt(2 * energy / mass)
+        return jnp.minimum(1.0, v_y / speed)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Force of a first loading, `min(k x^eta, F_y)` (m,) [N]."""

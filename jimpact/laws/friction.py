@@ -45,19 +45,16 @@ def frictional_impulses(
 
     Equation: `W p + W_nt p_t + b = 0`, or (`complementary`)
     `0 <= W p + W_nt p_t + b  _|_  p >= 0`, b = `normal` (m,) [m/s], and
-    `p_t in -mu p Sgn(u+ + e_t u-)`, mu = `friction`,
-    e_t = `tangential_restitution`, () or (m,).
+    `p_t in -mu p Sgn(u+ + e_t u-)`, mu = `friction`, e_t = `tangential_restitution`, ()
+    or (m,).
     """
     assert contact.slip is not None  # see `check_law`
     ones = jnp.ones_like(contact.gap_velocity)
-    slip = (
-        1 + jnp.repeat(tangential_restitution * ones, contact.tangents)
-    ) * contact.slip
-    solution = solve(
-        contact.whole_delassus,
-        normal,
-        slip,
-        friction * ones,
-        complementary=complementary,
-    )
+    mu = friction * ones
+    # Eq. (6.54): sticking is u+ = -e_t u-, and u+ + e_t u- = W_tn p + W_tt p_t + b_t
+    e_t = jnp.repeat(tangential_restitution * ones, contact.tangents)
+    b_t = (1 + e_t) * contact.slip
+    # Coulomb: p_t in -mu p Sgn(W_tn p + W_tt p_t + b_t)
+    a = contact.whole_delassus  # [[W, W_nt], [W_tn, W_tt]]
+    solution = solve(a, normal, b_t, mu, complementary=complementary)
     return Impulses(solution.normal, solution.tangential, solution.status)

@@ -3,6 +3,7 @@ time.
 """
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -121,10 +122,9 @@ def _history(
     t = dynamics.tangents
     units = dynamics.units
     program = dynamics.program(with_end_time=True)
-    leaves = dynamics.columns()[0]
-    differentiated = dataclasses.replace(
-        program, checkpoints=dynamics.adjoint == "checkpoints"
-    )
+    leaves, _ = dynamics.columns()
+    checkpoints = dynamics.adjoint == "checkpoints"
+    differentiated = dataclasses.replace(program, checkpoints=checkpoints)
     programs = (
         history_program(program, samples),
         history_program(differentiated, samples),
@@ -133,49 +133,53 @@ def _history(
     *rows, maximum, code = (x[..., 0] for x in rest)
     states = ContactStates(*rows)
     unit_force = units.momentum / units.time
+    unit_gamma = units.velocity * units.root
+    unit_energy = 0.5 * units.velocity**2
     root = jnp.repeat(units.root, t // len(gamma))
+    unit_slip = units.velocity * root
+    unit_p_t = units.velocity / root
+    unit_friction = unit_p_t / units.time
 
-    def sampled(x: jax.Array, before: Any = 0.0) -> jax.Array:
-        """Samples x; where nothing happens the value `before` the impact."""
-        return jnp.where(happens, x, before)
+    def sampled(x: jax.Array, otherwise: Any = 0.0) -> jax.Array:
+        """Samples x; where nothing happens the value before the impact."""
+        return jnp.where(happens, x, otherwise)
+
+    def change(p: jax.Array, p_t: jax.Array) -> jax.Array:
+        """Changes of velocity (s, n) by impulses, or accelerations by forces."""
+        if t:
+            return jax.vmap(partial(velocity_change, scene))(p, p_t)
+        return jax.vmap(lambda p: velocity_change(scene, p, None))(p)
 
     impulse = sampled(states.impulse * units.momentum[None])
-    tangential = sampled(states.tangential_impulse * (units.velocity / root)[None])
-    change = jax.vmap(lambda p, p_t: velocity_change(scene, p, p_t if t else None))
-    if contact.slip is None or not t:
-        slip = jnp.zeros(0, v.dtype)
-    else:
+    tangential = sampled(states.tangential_impulse * unit_p_t[None])
+    slip = jnp.zeros(0, v.dtype)
+    if contact.slip is not None and t:
         slip = contact.slip
     seconds = sampled(time[:, 0, 0] * units.time)
     force = sampled(states.force * unit_force[None])
-    friction = sampled(
-        states.tangential_force * (units.velocity / root / units.time)[None]
-    )
-    rates = sampled(
-        states.gap_velocity * (units.velocity * units.root)[None], gamma[None]
-    )
+    friction = sampled(states.tangential_force * unit_friction[None])
+    rates = sampled(states.gap_velocity * unit_gamma[None], gamma[None])
     # gap accelerations N^T M^-1 (N F + H F_t)
-    growth = jax.vmap(lambda dv: gap_velocity(scene, dv))(change(force, friction))
+    growth = jax.vmap(partial(gap_velocity, scene))(change(force, friction))
     size = jnp.where(happens, contact.size, 1.0)
     finite = jnp.all(jnp.isfinite(impulse)) & jnp.all(jnp.isfinite(seconds))
+    arguments = law, scene, v, NOTHING_GIVEN
     return History(
         time=seconds,
         force=force,
         indentation=sampled(states.indentation * units.indentation[None]),
-        energy=sampled(0.5 * units.velocity**2 * energy[..., 0]),
+        energy=sampled(unit_energy * energy[..., 0]),
         impulse=impulse,
         gap_velocity=rates,
         approach=-_integral(seconds, rates, growth),
         velocity=v[None] + change(impulse, tangential),
         tangential_force=friction,
         tangential_impulse=tangential,
-        slip=sampled(states.slip * (units.velocity * root)[None], slip[None]),
-        tangential_energy=sampled(0.5 * units.velocity**2 * states.tangential_energy),
+        slip=sampled(states.slip * unit_slip[None], slip[None]),
+        tangential_energy=sampled(unit_energy * states.tangential_energy),
         duration=sampled(time[-1, 0, 0] * units.time),
         maximum_force=sampled(maximum * unit_force),
-        status=traced.status(
-            (law, scene, v, NOTHING_GIVEN), sampled(code[0]), size, finite
-        ),
+        status=traced.status(arguments, sampled(code[0]), size, finite),
     )
 
 
@@ -183,11 +187,12 @@ def _integral(time: jax.Array, values: jax.Array, rates: jax.Array) -> jax.Array
     """Integrals (s, m) of `values` y (s, m) over `time` t (s,) from the first one on.
 
     Equation: per step h, `h (y_1 + y_2) / 2 + h^2 (y'_1 - y'_2) / 12` with their
-    derivatives y' =
-    `rates` (s, m): exact for cubics.
+    derivatives y' = `rates` (s, m): exact for cubics.
     """
-    step = jnp.diff(time)[:, None]
-    pieces = step / 2 * (values[1:] + values[:-1]) + step**2 / 12 * (
-        rates[:-1] - rates[1:]
-    )
-    return jnp.concatenate([jnp.zeros_like(values[:1]), jnp.cumsum(pieces, axis=0)])
+    h = jnp.diff(time)[:, None]
+    y_1 = values[:-1]
+    y_2 = values[1:]
+    dy_1 = rates[:-1]
+    dy_2 = rates[1:]
+    pieces = h / 2 * (y_2 + y_1) + h**2 / 12 * (dy_1 - dy_2)
+    return jnp.pad(jnp.cumsum(pieces, axis=0), ((1, 0), (0, 0)))

@@ -30,8 +30,8 @@ class ImpulseCorrelation(Law):
     `gamma_j < 0` and gives back e_j^2 of the work of compression (energetic
     restitution): with `p = s d`, d_i = 1, d_j = r_j, `a = W d`, the impulse ends at the
     larger root s of
-    `d.a s^2 / 2 + d.gamma s + sum (1 - e_j^2) d_j gamma_j^2 / (2 a_j) = 0`
-    (over contacts with gamma_j < 0). Then the next contact that approaches collides.
+    `d.a s^2 / 2 + d.gamma s + sum (1 - e_j^2) d_j gamma_j^2 / (2 a_j) = 0` (over
+    contacts with gamma_j < 0). Then the next contact that approaches collides.
 
     The ratio is one of this scene and this kind of approach: it is measured or fitted.
     It is constant during the impact, where LZB's `dp_j / dp_i` begins at 0 and grows
@@ -84,12 +84,12 @@ class ImpulseCorrelation(Law):
             closed = np.asarray(scene.closed)
             low, high = interval(scene, self.restitution)
         ratio = np.broadcast_to(np.asarray(self.ratio, float), (m, m))
-        for i, j in zip(
-            *np.nonzero(~np.isnan(low) & closed[:, None] & closed[None, :])
-        ):
-            least = low[i, j] * (1 - ROUNDING)
-            most = high[i, j] * (1 + ROUNDING)
-            if not least <= ratio[i, j] <= most:
+        both_closed = closed[:, None] & closed[None, :]
+        pairs = np.argwhere(~np.isnan(low) & both_closed)
+        for i, j in pairs:
+            smallest = low[i, j] * (1 - ROUNDING)
+            largest = high[i, j] * (1 + ROUNDING)
+            if not smallest <= ratio[i, j] <= largest:
                 raise ValueError(
                     f"Argument `ratio` must lie in [{low[i, j]:.6g}, {high[i, j]:.6g}] "
                     f"for contact "
@@ -119,13 +119,12 @@ def interval(scene: Scene, restitution: jax.Array) -> tuple[np.ndarray, np.ndarr
     does not press j (`W_ij >= 0`).
     """
     w = np.asarray(as_matrix(delassus_matrix(scene)), float)
-    # W_ii, W_jj
-    own = np.diag(w)[:, None]
-    other = np.diag(w)[None, :]
-    # e_i^2
-    square = np.broadcast_to(np.asarray(restitution, float) ** 2, (len(w),))[:, None]
-    presses = w < -precision(float).noise * np.sqrt(own * other)
-    off = np.where(presses, w, np.nan)
-    linear = (1 - square) * off
-    high = (-linear + np.sqrt(linear**2 + 4 * other * square * own)) / (2 * other)
-    return -off / other, high
+    w_ii = np.diag(w)[:, None]
+    w_jj = np.diag(w)[None, :]
+    e = np.broadcast_to(np.asarray(restitution, float), (len(w),))[:, None]
+    presses = w < -precision(float).noise * np.sqrt(w_ii * w_jj)
+    w_ij = np.where(presses, w, np.nan)
+    linear = (1 - e**2) * w_ij
+    root = np.sqrt(linear**2 + 4 * w_jj * e**2 * w_ii)
+    high = (-linear + root) / (2 * w_jj)
+    return -w_ij / w_jj, high

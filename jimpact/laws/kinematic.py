@@ -84,13 +84,13 @@ def prescribed_impulses(contact: Contact, required: jax.Array) -> Impulses:
     `d_j = sqrt(W_jj)`; of redundant contacts those of least |pbar|.
     """
     w = contact.delassus
-    norm = jnp.sqrt(diagonal(w))
-    g = as_matrix(w) / (norm[:, None] * norm[None, :])
-    pbar, singular, unsolved = solve_symmetric(
-        g, -required / norm, regular=is_regular(w)
-    )
+    d = jnp.sqrt(diagonal(w))
+    g = as_matrix(w) / (d[:, None] * d[None, :])
+    solution = solve_symmetric(g, -required / d, regular=is_regular(w))
+    pbar, singular, unsolved = solution
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
-    return Impulses(pbar / norm, None, jnp.where(unsolved, CODE["infeasible"], code))
+    code = jnp.where(unsolved, CODE["infeasible"], code)
+    return Impulses(pbar / d, None, code)
 
 
 class _WithCoefficient(Kinematic):
@@ -154,8 +154,7 @@ class Moreau(_WithCoefficient):
 
     Equation: `0 <= G pbar + (I + E) qn-  _|_  pbar >= 0`, in normalized gap velocities
     `qn = gamma / |grad f|` and impulses `pbar = |grad f| p`; with a scalar or diagonal
-    E
-    `0 <= gamma+ + e gamma-  _|_  p >= 0`. With friction also
+    E `0 <= gamma+ + e gamma-  _|_  p >= 0`. With friction also
     `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
 
     Args:
@@ -169,8 +168,8 @@ class Moreau(_WithCoefficient):
     driven together (the law then asks for gamma+ >= -e gamma- < 0 only); `energy_gain`,
     with unequal e; `infeasible` (a body squeezed between walls with unequal e);
     `impulse_not_unique` for redundant contacts (the p of least |pbar| is returned,
-    where friction allows it). With friction there
-    is a solution unless contacts jam (impulses that move nothing).
+    where friction allows it). With friction there is a solution unless contacts jam
+    (impulses that move nothing).
 
     Derivatives are one-sided where a contact is about to take part (p_j = 0 = gamma+ +
     e gamma-).
@@ -207,12 +206,10 @@ class RestitutionMatrix(Kinematic):
     `pbar = -G^-1 (I + E) qn-`, `p_j = pbar_j / |grad f_j|`; tangential velocities are
     conserved. With E (m + k, m + k), k = n - m - b: `(qn+, qt+) = -E (qn-, qt-)` in the
     basis of `ji.theory.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along
-    the
-    scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t
-    where several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn =
-    0, E_tt = -I.) Bilateral constraints distort G and n_q as in (6.35). With friction,
-    and E (m, m),
-    `qn+ = -E qn-` and `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
+    the scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least
+    p_t where several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction
+    E_tn = 0, E_tt = -I.) Bilateral constraints distort G and n_q as in (6.35). With
+    friction, and E (m, m), `qn+ = -E qn-` and `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
 
     Args:
         matrix: E, (m, m) or (m + k, m + k), without dimension. Diagonal, it is

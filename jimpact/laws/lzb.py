@@ -4,6 +4,7 @@ ratios.
 
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,6 +20,7 @@ from jimpact.core.law import (
     parameter,
 )
 from jimpact.core.scene import Scene
+from jimpact.events.contact_flow import ContactEquations, Exponent, power
 from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,
@@ -31,6 +33,34 @@ from jimpact.laws.forces import Bistiffness
 from jimpact.numerics.derive import ADJOINTS
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import check_rtol
+
+# ---- The equations of a contact j, Brogliato (2016), 6.3.1, with the errata of
+# docs/equations.md. They are written in time, dp_j = F_j dt, and in the indentation x_j
+# that stores the energy E_j. Of all contacts (6.69) is gamma' = W F.
+
+
+# Eq. (6.70): dp_j / dp_i = Gamma_ji = F_j / F_i,
+# F_j = ((1 + eta_j) E_j)^(eta_j / (1 + eta_j)) k_j^(1 / (1 + eta_j))
+def force(x: jax.Array, k: jax.Array, eta: Exponent) -> jax.Array:
+    """`F_j = k_j x_j^eta_j` in loading and unloading; 0 where x_j <= 0."""
+    return k * power(x, eta)
+
+
+# Eq. (6.71) loading, (6.72) unloading: dE_j = -gamma_j / s_j^2 dp_j, so that
+# x_j' = -gamma_j / s_j^2
+def scale(unloads: jax.Array, e: jax.Array) -> jax.Array:
+    """s_j: 1 in loading, e_j in unloading, so that e_j^2 of the work is returned."""
+    return jnp.where(unloads, e, 1.0)
+
+
+# E_j = k_j x_j^(eta_j + 1) / (eta_j + 1), the work of loading W_c,j of 6.3.1
+def depth(q: jax.Array, k: jax.Array, eta: jax.Array) -> jax.Array:
+    """x_j at which E_j = q^2 / 2, q [sqrt(J)]."""
+    # q^2 / k may be too small or too large for a number where x_j is not
+    return (jnp.sqrt((eta + 1) / 2) * q / jnp.sqrt(k)) ** (2 / (eta + 1))
+
+
+BISTIFFNESS = ContactEquations(force, scale, depth)
 
 # Tolerances of v+ if the law has no `rtol`, relative to max |v-|. Ten times more would
 # make every outcome right to one digit less.
@@ -64,8 +94,9 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:  # law: LZB, Compl
     method = method_for(law.method, contact, law.friction is not None, springs)
     if law.rtol is not None:
         return method, law.rtol
-    default = default_rtol(method, contact.gap_velocity.dtype)
-    return method, default if contact.rtol is None else contact.rtol
+    if contact.rtol is not None:
+        return method, contact.rtol
+    return method, default_rtol(method, contact.gap_velocity.dtype)
 
 
 def check_few_contacts(scene: Scene) -> None:
@@ -216,7 +247,8 @@ class LZB(Law):
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol`, or its default at this `contact`."""
-        return solver_of(self, contact)[1]
+        _, rtol = solver_of(self, contact)
+        return rtol
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]
@@ -240,14 +272,17 @@ class LZB(Law):
         law.
         """
         method, default = solver_of(self, contact)
+        if rtol is None:
+            rtol = default
         problem, units = dimensionless(
+            BISTIFFNESS,
             contact.delassus,
             contact.gap_velocity,
             self.restitution,
             self.stiffness,
             self.exponent,
             contact.stored,
-            default if rtol is None else rtol,
+            rtol,
             closed=contact.closed,
         )
         if self.friction is not None:
@@ -255,10 +290,15 @@ class LZB(Law):
                 contact, self.friction, self.tangential_stiffness, units
             )
             problem = problem._replace(tangential=tangential)
-        structure = contact.structure
-        most = self.max_steps
         return Dynamics(
-            problem, units, self.exponent, structure, most, method, self.adjoint
+            problem,
+            units,
+            BISTIFFNESS,
+            self.exponent,
+            contact.structure,
+            self.max_steps,
+            method,
+            self.adjoint,
         )
 
     @full_precision

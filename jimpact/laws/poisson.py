@@ -38,8 +38,8 @@ class Poisson(Law):
     depends on how they share p_c (the least one is taken): without friction where their
     e differ, with friction where another share expands to another v+ (up to 3 contacts:
     those with the least or most p_c of a contact are tried; of more contacts where
-    their e differ); `energy_gain` where e
-    above 1 creates energy. With friction also as in `Moreau`.
+    their e differ); `energy_gain` where e above 1 creates energy. With friction also as
+    in `Moreau`.
 
     Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j
     up to 1: of all s >= 0 the law takes that of least energy, and
@@ -94,17 +94,24 @@ class Poisson(Law):
         if mu is not None and e_t is not None:
             return self._with_friction(contact, mu, e_t)
         w = contact.delassus
+        e = self.restitution
+
+        # Eq. (6.76), t_c: 0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0
         compression = solve_lcp(w, contact.gap_velocity)
-        returned = self.restitution * compression.z
-        supplement = solve_lcp(w, compression.w + w @ returned)
-        code = jnp.maximum(compression.code, supplement.code)
-        if self.restitution.ndim == 1 and not is_regular(w):
-            free = _free_columns(as_matrix(w), compression.z > 0)
-            ambiguous = _depends_on_sharing(as_matrix(w), self.restitution, free)
-            code = jnp.maximum(
-                code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"])
-            )
-        return Impulses(compression.z + returned + supplement.z, None, code)
+        p_c = compression.z
+        gamma_c = compression.w
+
+        # Eq. (6.77), t_f: 0 <= gamma+ = gamma_c + W (e p_c + s)  _|_  s >= 0
+        returned = e * p_c
+        expansion = solve_lcp(w, gamma_c + w @ returned)
+        s = expansion.z
+
+        code = jnp.maximum(compression.code, expansion.code)
+        if e.ndim == 1 and not is_regular(w):
+            free = _free_columns(as_matrix(w), p_c > 0)
+            ambiguous = _depends_on_sharing(as_matrix(w), e, free)
+            code = jnp.maximum(code, _several_where(ambiguous))
+        return Impulses(p_c + returned + s, None, code)
 
     def _with_friction(
         self, contact: Contact, mu: jax.Array, e_t: jax.Array
@@ -115,37 +122,49 @@ class Poisson(Law):
         Equation: `p = (1 + e) p_c + s`, `p_t = p_tc + p_te`.
         """
         assert contact.slip is not None  # see `check_law`
-        a = contact.whole_delassus
+        a = contact.whole_delassus  # [[W, W_nt], [W_tn, W_tt]]
         gamma = contact.gap_velocity
+        u = contact.slip
         mu = mu * jnp.ones_like(gamma)
         e = self.restitution * jnp.ones_like(gamma)
         e_t = jnp.repeat(e_t * jnp.ones_like(mu), contact.tangents)
-        first = solve(a, gamma, contact.slip, mu, complementary=True)
-        expansion = _Expansion(
-            a, jnp.concatenate([gamma, (1 + e_t) * contact.slip]), mu, e
-        )
-        compression = jnp.concatenate([first.normal, first.tangential])
-        second, velocity = expansion.after(compression)
-        code = jnp.maximum(first.status, second.status)
+
+        # Eq. (6.76), and p_tc in -mu p_c Sgn(u_c), u_c = u- + W_tn p_c + W_tt p_tc
+        compression = solve(a, gamma, u, mu, complementary=True)
+        p_c = compression.normal
+        p_tc = compression.tangential
+
+        # Eq. (6.77), and p_te in -mu (e p_c + s) Sgn(u+ + e_t u-)
+        b = jnp.concatenate([gamma, (1 + e_t) * u])
+        problem = _Expansion(a, b, mu, e)
+        impulse = jnp.concatenate([p_c, p_tc])
+        expansion, velocity = problem.after(impulse)
+        s = expansion.normal
+        p_te = expansion.tangential
+
+        code = jnp.maximum(compression.status, expansion.status)
         ambiguous = jnp.asarray(False)
         if self.restitution.ndim == 1:
-            both = jnp.concatenate([e, jnp.zeros_like(contact.slip)])
-            ambiguous = _depends_on_sharing(a, both, first.free)
-        if first.shares is not None:
-            other = _expands_otherwise(expansion, compression, velocity, first.shares)
-            ambiguous = ambiguous | other
-        code = jnp.maximum(
-            code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"])
-        )
-        p = (1 + e) * first.normal + second.normal
-        return Impulses(p, first.tangential + second.tangential, code)
+            returned = jnp.concatenate([e, jnp.zeros_like(u)])
+            ambiguous = _depends_on_sharing(a, returned, compression.free)
+        if compression.shares is not None:
+            ambiguous = ambiguous | _expands_otherwise(
+                problem, impulse, velocity, compression.shares
+            )
+        code = jnp.maximum(code, _several_where(ambiguous))
+        return Impulses((1 + e) * p_c + s, p_tc + p_te, code)
+
+
+def _several_where(ambiguous: jax.Array) -> jax.Array:
+    """The status `several_outcomes` where v+ is ambiguous, else `ok`."""
+    return jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"])
 
 
 class _Expansion(NamedTuple):
     """The friction problem of expansion, posed by the impulses of compression."""
 
     matrix: jax.Array  # [[W, W_nt], [W_tn, W_tt]] (m + t, m + t)
-    before: jax.Array  # (m + t,) gamma- and (1 + e_t) u-
+    b: jax.Array  # gamma- and (1 + e_t) u- (m + t,)
     friction: jax.Array  # mu (m,)
     restitution: jax.Array  # e (m,)
 
@@ -156,15 +175,14 @@ class _Expansion(NamedTuple):
         lead.
         """
         m = len(self.friction)
-        zero = precision(self.before.dtype)
+        zero = precision(self.b.dtype)
         p_c = compression[:m]
         returned = self.restitution * p_c
         impulse = compression + jnp.pad(returned, (0, len(compression) - m))
-        size = jnp.abs(self.before) + jnp.abs(self.matrix) @ jnp.abs(impulse)
+        size = jnp.abs(self.b) + jnp.abs(self.matrix) @ jnp.abs(impulse)
         # rounding must not move contacts that compression has brought to rest
-        velocity = without_rounding(
-            self.before + self.matrix @ impulse, zero.accumulated * size
-        )
+        velocity = self.b + self.matrix @ impulse
+        velocity = without_rounding(velocity, zero.accumulated * size)
         # e p_c loads friction; eps^2 p_c keeps its slope in e at e = 0
         load = returned + zero.eps**2 * p_c
         x = solve(
@@ -207,7 +225,7 @@ def _expands_otherwise(
             solution.
             """
             other, after = expansion.after(share)
-            apart = jnp.abs(after - velocity) > root * jnp.abs(expansion.before).max()
+            apart = jnp.abs(after - velocity) > root * jnp.abs(expansion.b).max()
             return jnp.any(apart) & (other.status < CODE["infeasible"])
 
         return jnp.any(jax.lax.map(differs, shares))
@@ -223,13 +241,12 @@ def _free_columns(w: jax.Array, loaded: jax.Array) -> jax.Array:
     Equation: `D^-1 P`, P the projector on the null space of `D^-1 W D^-1` between
     loaded contacts, `D = diag(sqrt(W_jj))`.
     """
-    norm = jax.lax.stop_gradient(jnp.sqrt(jnp.diagonal(w)))
-    both = loaded[:, None] & loaded[None, :]
+    d = jax.lax.stop_gradient(jnp.sqrt(jnp.diagonal(w)))
+    between_loaded = loaded[:, None] & loaded[None, :]
     unit = jnp.eye(len(loaded), dtype=w.dtype)
-    projector, _ = null_projector(
-        jnp.where(both, w / (norm[:, None] * norm[None, :]), unit)
-    )
-    return projector / norm[:, None]
+    normalized = w / (d[:, None] * d[None, :])
+    projector, _ = null_projector(jnp.where(between_loaded, normalized, unit))
+    return projector / d[:, None]
 
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Array:
@@ -240,6 +257,6 @@ def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Arra
     rounding.
     """
     w, e = jax.lax.stop_gradient((w, e))
-    norm = jnp.sqrt(jnp.diagonal(w))
-    returned = w @ (e[:, None] * free) / jnp.where(norm > 0, norm, 1.0)[:, None]
+    d = jnp.sqrt(jnp.diagonal(w))
+    returned = w @ (e[:, None] * free) / jnp.where(d > 0, d, 1.0)[:, None]
     return jnp.abs(returned).max() > precision(w.dtype).root

@@ -12,8 +12,7 @@ class Routh(Law):
     """Rigid contacts whose impulses grow in constant ratios; one e for their work.
 
     Equation: `p = s p_c` with `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`. The net
-    work
-    `-(2 s - s^2) p_c^T W p_c / 2` of all contacts is least at s = 1, the end of
+    work `-(2 s - s^2) p_c^T W p_c / 2` of all contacts is least at s = 1, the end of
     compression, and the share e^2 of it is given back (energetic restitution): s = 1 +
     e. Of unequal e_j, e^2 is the mean of e_j^2, weighted by what each contact takes up
     in compression, `-p_cj gamma_j- / 2`.
@@ -45,22 +44,28 @@ class Routh(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """`p = (1 + e) p_c` (m,) [N s] with the impulses p_c of compression, e of all
-        contacts.
+        """`p = (1 + e) p_c` (m,) [N s] with the impulses p_c of compression.
+
+        Of unequal e_j, `e^2 = sum e_j^2 W_j / sum W_j`, `W_j = p_cj max(-gamma_j-, 0)`;
+        where that is 0, e is 0, with the slope `sqrt(W_j / sum W)` in each e_j.
         """
         w = contact.delassus
         gamma = contact.gap_velocity
         e = self.restitution
+
+        # the end of compression, s = 1: 0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0
         compression = solve_lcp(w, gamma)
+        p_c = compression.z
+
+        # energetic restitution: the share e^2 of the work of compression is given back
         if e.ndim:
-            # twice that taken up by each contact
-            work = compression.z * jnp.maximum(-gamma, 0.0)
+            work = p_c * jnp.maximum(-gamma, 0.0)  # twice that of each contact
             total = jnp.sum(work)
             share = work / jnp.where(total > 0, total, 1.0)
-            returned = jnp.sum(e**2 * share)  # e^2 of the whole impact
-            root = jnp.sqrt(jnp.where(share > 0, share, 1.0))
-            at_zero = jnp.sum(jnp.where(share > 0, root * e, 0.0))  # 0, with its slopes
-            e = jnp.where(
-                returned > 0, jnp.sqrt(jnp.where(returned > 0, returned, 1.0)), at_zero
-            )
-        return Impulses((1 + e) * compression.z, None, compression.code)
+            square = jnp.sum(e**2 * share)  # e^2 of the whole impact
+            positive = square > 0
+            works = share > 0
+            root = jnp.sqrt(jnp.where(works, share, 1.0))
+            at_zero = jnp.sum(jnp.where(works, root * e, 0.0))  # 0, with its slopes
+            e = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), at_zero)
+        return Impulses((1 + e) * p_c, None, compression.code)

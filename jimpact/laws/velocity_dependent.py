@@ -28,6 +28,7 @@ from jimpact.numerics.tridiagonal import as_matrix, diagonal
 from jimpact.tools.checks import as_float_array, check_kind, check_values
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
+from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
 
 # Speeds [m/s] at which a user's function of the speed is tried once.
@@ -43,25 +44,23 @@ def _curve(value: Any) -> Any:
     """
     if value is None or callable(value):
         return value
-    pair = [np.asarray(as_float_array("curve", each), float) for each in value]
-    if (
-        len(pair) != 2
-        or pair[0].ndim != 1
-        or pair[0].shape != pair[1].shape
-        or len(pair[0]) < 2
-    ):
+    columns = [np.asarray(as_float_array("curve", x), float) for x in value]
+    shapes = [x.shape for x in columns]
+    is_table = len(columns) == 2 and len(set(shapes)) == 1 and columns[0].ndim == 1
+    if not is_table or len(columns[0]) < 2:
         raise ValueError(
             "Argument `curve` must be a function of the speed, or (speeds, values) of "
             "two or more "
-            f"rows, but has shapes {[each.shape for each in pair]}."
+            f"rows, but has shapes {shapes}."
         )
-    for each in pair:
-        check_values("curve", each, low=0.0)
-    if not (np.diff(pair[0]) > 0).all():
+    speeds, values = columns
+    check_values("curve", speeds, low=0.0)
+    check_values("curve", values, low=0.0)
+    if not (np.diff(speeds) > 0).all():
         raise ValueError(
-            f"Argument `curve` must have speeds that rise, but has {pair[0].tolist()}."
+            f"Argument `curve` must have speeds that rise, but has {speeds.tolist()}."
         )
-    return tuple(StaticNumbers(each.tolist()) for each in pair)
+    return StaticNumbers(speeds.tolist()), StaticNumbers(values.tolist())
 
 
 @forwards_to_law
@@ -180,7 +179,7 @@ class VelocityDependent(Law):
         if self.yield_speed is None:
             return f
         yields = safe >= self.yield_speed
-        y = jnp.where(yields, self.yield_speed / jnp.where(yields, safe, 1.0), 1.0)
+        y = quotient(self.yield_speed, safe, where=yields, otherwise=1.0)
         smooth = moving & (y > 0)  # the root has no slope at 0
         square = jnp.where(smooth, y**2 + (1 - y**2) * f**2, 1.0)
         return jnp.where(smooth, jnp.sqrt(square), f)
@@ -189,8 +188,9 @@ class VelocityDependent(Law):
         """Values of the curve at speeds v [m/s]; a table is linear between its rows."""
         if callable(self.curve):
             return jnp.asarray(self.curve(v), v.dtype)
-        speeds, values = (jnp.asarray(each, v.dtype) for each in self.curve)
-        return jnp.interp(v, speeds, values)
+        speeds, values = self.curve
+        table = jnp.asarray(speeds, v.dtype), jnp.asarray(values, v.dtype)
+        return jnp.interp(v, *table)
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
@@ -241,10 +241,9 @@ def approach_speed(contact: Contact) -> jax.Array:
     speed = jnp.maximum(-contact.gap_velocity, 0.0)
     w = as_matrix(contact.delassus)
     root = jnp.sqrt(diagonal(contact.delassus))
-    least = precision(speed.dtype).accumulated  # of normals and of M^-1
-    coupled, constant = jax.lax.stop_gradient(
-        (jnp.abs(w) > least * root[:, None] * root[None, :], speed)
-    )
+    rounding = precision(speed.dtype).accumulated  # of normals and of M^-1
+    coupled = jnp.abs(w) > rounding * root[:, None] * root[None, :]
+    coupled, constant = jax.lax.stop_gradient((coupled, speed))
 
     def passed_on(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Fastest contact (m,) known to each one or to its neighbours; True () if one
@@ -256,8 +255,13 @@ def approach_speed(contact: Contact) -> jax.Array:
         faster = constant[other] > constant[fastest]
         return jnp.where(faster, other, fastest), jnp.any(faster)
 
+    def changes(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+        """True () if a contact has learned of a faster one."""
+        _, changed = state
+        return changed
+
     first = jnp.arange(len(speed)), jnp.asarray(True)
-    fastest, _ = while_loop(lambda state: state[1], passed_on, first)
+    fastest, _ = while_loop(changes, passed_on, first)
     return speed[fastest]
 
 

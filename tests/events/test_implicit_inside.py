@@ -14,6 +14,7 @@ from jimpact.core.contact import contact_of
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import Chain, Dense
 from jimpact.events.impact_dynamics import method_for
+from jimpact.laws.lzb import BISTIFFNESS
 from jimpact.numerics.driver import SLOTS_IN_SPACE
 from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
 
@@ -180,6 +181,7 @@ def steps_of_two(restitution, gapped):
     """Steps of two contacts without friction that do not act on each other."""
     return implicit_steps.ImplicitSteps(
         coupling=Dense(jnp.eye(2)[..., None]),
+        equations=BISTIFFNESS,
         omega=jnp.array([[1.0], [2.0]]),
         restitution=restitution * jnp.ones((2, 1)),
         exponent_array=None,

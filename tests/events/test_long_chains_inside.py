@@ -20,9 +20,8 @@ def test_a_look_ahead_concludes_nothing_without_a_margin():
     scene, m = ji.chain([1.0] * ROW), ROW - 1
     contact = contact_of(scene, jnp.zeros(ROW).at[0].set(1.0))
     dynamics = ji.LZB(0.5).dynamics(contact)
-    flow, modes, y = flow_of(
-        jax.tree.map(lambda x: x[..., None], dynamics.problem), 1.5, "chain"
-    )
+    problem = jax.tree.map(lambda x: x[..., None], dynamics.problem)
+    flow, modes, y = flow_of(problem, dynamics.equations, 1.5, "chain")
     every, asked = jnp.ones((m, 1), bool), jnp.ones((1, 1), bool)
     part = (jnp.arange(ROW - 1.0, 0.0, -1.0) / ROW)[
         :, None
