@@ -60,8 +60,8 @@ class Compliant(Law):
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None:
             none.
         tangential_stiffness: kappa > 0, scalar or (m,), of a tangential spring
-            `k_t = kappa dF/dx(x)` with a force of x alone, as in `LZB`; None: contacts
-            stick rigidly.
+            `k_t = kappa dF/dx(x)` with a force of x alone, as in `LZB`; motions by
+            contact forces keep it from step to step; None: contacts stick rigidly.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed
             contacts; not with a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with

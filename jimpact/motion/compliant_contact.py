@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jimpact.bodies.assembly import Bodies
 from jimpact.core.law import Law
 from jimpact.events.contact_flow import Phase
 from jimpact.laws.forces import Force
 from jimpact.motion.compliant_flow import (
+    CompliantFlow,
     ContactModes,
     compliant_flow,
     contact_modes,
@@ -48,6 +50,12 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.record import KIND_CODE
 from jimpact.motion.run import course_of, end_of, goes_on
+from jimpact.motion.spring_flow import (
+    margins_of_springs,
+    rows_at_start,
+    spring_flow,
+)
+from jimpact.motion.start import Start
 from jimpact.motion.tables import (
     Course,
     MotionEnd,
@@ -102,13 +110,6 @@ def force_of(law: Law) -> Force:
             "Argument `law` must use gaps and have a `contact_force` (Compliant) for "
             f"method='contact_forces', but is {law!r}."
         )
-    if getattr(law, "tangential_stiffness", None) is not None:
-        raise TypeError(
-            "Argument `law` must have no `tangential_stiffness` in a motion by contact "
-            "forces, but "
-            f"is {law!r}: by events each impact has its springs, which begin with xi = "
-            f"0."
-        )
     if force.bound is not None:
         raise TypeError(
             "Argument `law` must have a force without bound in a motion: what yields "
@@ -116,6 +117,37 @@ def force_of(law: Law) -> Force:
             f"`impact`, but the force is {force!r}."
         )
     return force
+
+
+def tangential_stiffness_of(law: Law, start: Start) -> Float[Array, " m"] | None:
+    """kappa (m,) of the law's tangential springs in a motion by contact forces, or
+    None.
+
+    Raises:
+        ValueError: springs without friction, or of bodies whose tangents turn while
+            they touch: springs would turn with them.
+    """
+    kappa = getattr(law, "tangential_stiffness", None)
+    if kappa is None:
+        return None
+    if start.friction is None:
+        raise ValueError(
+            "Argument `friction` must be given with `tangential_stiffness`, whose "
+            "springs hold below mu F."
+        )
+    body = start.system.body
+    if start.in_space and isinstance(body, Bodies) and _touch_each_other(body):
+        raise ValueError(
+            "Argument `tangential_stiffness` must be None in space in a motion by "
+            "contact forces of bodies that touch each other, whose tangents turn: it "
+            f"is for contacts with planes, but {type(body).__name__} has pairs."
+        )
+    return jnp.broadcast_to(kappa, (start.contacts,)).astype(start.q.dtype)
+
+
+def _touch_each_other(body: Bodies) -> bool:
+    """True if a contact is between two bodies; the second one of a plane is -1."""
+    return bool((body.pairs_in_contact() >= 0).all(axis=1).any())
 
 
 def compliant_motion(
@@ -130,7 +162,7 @@ def compliant_motion(
 
 def _start(problem: MotionProblem) -> State:
     """State at the beginning: indentations `x = -f`, 0 of closed gaps; no impulses
-    yet.
+    yet, springs xi = 0.
     """
     gap = gaps(problem.system, problem.q0, problem.times[0])
     x = jnp.where(jnp.abs(gap) <= problem.settings.closed_below, 0.0, -gap)
@@ -139,7 +171,10 @@ def _start(problem: MotionProblem) -> State:
     else:
         each = problem.tangents // problem.contacts
     impulses = jnp.zeros((1 + each, len(x)), x.dtype)
-    return problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
+    start = problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
+    if problem.tangential_stiffness is None:
+        return start
+    return start._replace(spring=impulses[1:])
 
 
 def _run(max_events: int, until_apart: bool, problem: MotionProblem) -> MotionEnd:
@@ -167,7 +202,11 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     Compression where the indentation x > 0, or x = 0 and the contact does not open;
     expansion where x > 0 and it opens, of a force that has this phase; else open.
     """
-    system, force, mu, _, _, _, times, m, _ = problem
+    system = problem.system
+    force = problem.law
+    mu = problem.mu
+    times = problem.times
+    m = problem.contacts
     state = _start(problem)
     gamma, slip = _rates(problem, state)
     x = state.contact[0]
@@ -180,12 +219,22 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     margins = 2 * m
     fastest = jnp.maximum(-gamma, 0.0)
     if mu is not None:
-        phase = mode_rows(ContactModes(phase, no_modes(m, x.dtype)))
-        margins = 3 * m
         fastest = jnp.concatenate([fastest, slip])
-    flight = first_flight(system, state, phase[:, None], margins, times)
-    contacts = contacts_at(system, state.q, state.v, state.t, False)
-    stable = stable_step(force, flight.aim.modes, contacts, state)
+    if problem.tangential_stiffness is not None:
+        rows = rows_at_start(problem, state, phase)
+        margins = margins_of_springs(problem)
+    elif mu is not None:
+        rows = mode_rows(ContactModes(phase, no_modes(m, x.dtype)))
+        margins = 3 * m
+    else:
+        rows = phase
+    flight = first_flight(system, state, rows[:, None], margins, times)
+    if problem.tangential_stiffness is not None:
+        flow = spring_flow(problem, state, flight.aim.modes, fastest)
+        stable = flow.longest
+    else:
+        contacts = contacts_at(system, state.q, state.v, state.t, False)
+        stable = stable_step(force, flight.aim.modes, contacts, state)
     flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
     # friction is to be decided
     flight = flight._replace(event=flight.event.at[:m].set(True))
@@ -218,10 +267,11 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
 
     Contacts with slip slide. All others stick if forces with normal forces F of the law
     hold them: `|a_t| <= within` at `|lambda_t| <= mu F`; else modes solve
-    `choose_with_friction` for given normal forces. Without an event modes remain.
+    `choose_with_friction` for given normal forces. Without an event modes remain, and
+    with tangential springs, which decide by themselves.
     """
     system, force, mu, settings, *_ = problem
-    if mu is None:
+    if mu is None or problem.tangential_stiffness is not None:
         return run
     at = run.flight.state
     m = problem.contacts
@@ -298,16 +348,22 @@ def _one_pass(
     times = problem.times
     flight = run.flight
     m = problem.contacts
-    flow = compliant_flow(problem, flight.state, flight.aim.modes, run.fastest)
+    springs = problem.tangential_stiffness is not None
+    given = problem, flight.state, flight.aim.modes, run.fastest
+    flow: CompliantFlow
+    if springs:
+        flow = spring_flow(*given)
+    else:
+        flow = compliant_flow(*given)
     settings = problem.settings
     # errors of time and works, then of indentations and impulses by the scales of the
     # contacts
-    ledger = allowed_errors(system, settings, flight.state, 1.0)[
-        : -flight.state.contact.size
-    ]
+    without = flight.state._replace(contact=flight.state.contact[:0], spring=())
+    ledger = allowed_errors(system, settings, without, 1.0)
     depth = flow.scales.depth
     impulse = flow.scales.impulse
     sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
+    sizes.extend(flow.sizes_of_springs(flight.state))
     allowed = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
     flown, _ = one_pass(flow, settings, allowed, times, flight)
     before = flight.aim.modes[:m, 0]
@@ -323,12 +379,15 @@ def _one_pass(
     stopped = none
     vanished = run.vanished
     if problem.mu is not None:
+        fastest = jnp.concatenate([fastest, slip])
+    if springs:
+        turned = flown.event[2 * m : 3 * m]
+    elif problem.mu is not None:
         friction = contact_modes(flight.aim.modes, flown.state).friction
         flown, vanished = _ended_slip(problem, run, flown, friction, slip)
         fired = flown.event[2 * m :]
         stopped = slip_stops(settings, friction, fired, slip, flow.scales.slip)
         turned = (fired & friction.stick) | stopped
-        fastest = jnp.concatenate([fastest, slip])
         flown = flown._replace(state=flow.stopped(stopped, flown.state))
     at = flown.state
     happened = jnp.any(closed | opened | turned)

@@ -73,7 +73,7 @@ class ContactModes(NamedTuple):
     friction: Modes
 
 
-def _contact_scales(
+def contact_scales(
     force: Force, contacts: Contacts, fastest: Float[Array, " s"]
 ) -> ContactScales:
     """Scales of contacts from their largest gap velocities, and slips after them [m/s]
@@ -146,7 +146,7 @@ class CompliantFlow(MotionFlow):
         contacts, force = self.contact_forces(const, at)
         gamma = contacts.normal.rate
         push = force.normal
-        closing = _unloading(self.force, const.phase, -gamma)
+        closing = unloading(self.force, const.phase, -gamma)
         friction, base = contact_powers(self.system, contacts, force, at.t)
         remembered = [closing, push]
         if force.tangential is not None:
@@ -161,8 +161,21 @@ class CompliantFlow(MotionFlow):
             base_work=base,
             contact_work=jnp.stack([push * gamma, friction]),
             contact=jnp.stack(remembered),
+            spring=self.spring_rates(const, at, contacts, force),
         )
         return jnp.concatenate(self.rows_of(rates, at, const.friction, contacts, force))
+
+    def spring_rates(
+        self, const: ContactModes, at: State, contacts: Contacts, force: Forces
+    ) -> Float[Array, "b m"] | tuple[()]:
+        """Rates of tangential springs: none, as contacts stick rigidly."""
+        return ()
+
+    def sizes_of_springs(self, at: State) -> list[Float[Array, " m"]]:
+        """Sizes of the rows of tangential springs, of which steps may err by `rtol`:
+        none.
+        """
+        return []
 
     def along_tangents(self, tangential: Float[Array, " t"]) -> Float[Array, " t"]:
         """Tangential forces along the tangents of the body, from those along `axes`."""
@@ -245,6 +258,22 @@ class CompliantFlow(MotionFlow):
         """
         at = unpacked(self.like, y)
         phase, friction = self.constants(modes)
+        after, at = self.switched_phases(phase, at, which)
+        rows = after
+        if self.mu is not None:  # friction starts anew with the force
+            keeps = loaded(phase) & loaded(after)
+            rows = mode_rows(ContactModes(after, friction._replace(active=keeps)))
+        state = packed(at)
+        # `error_only_rows` stay as they are
+        state = jnp.concatenate([state, y[len(state) :]])
+        return rows[:, None].astype(modes.dtype), state
+
+    def switched_phases(
+        self, phase: Int[Array, " m"], at: State, which: Bool[Array, "margins 1"]
+    ) -> tuple[Int[Array, " m"], State]:
+        """Phases after the events `which`, and the state: x = 0 where a contact closed
+        or opened, impulses 0 where it closed.
+        """
         m = len(phase)
         by_x = which[:m, 0]
         by_g = which[m : 2 * m, 0]
@@ -269,14 +298,7 @@ class CompliantFlow(MotionFlow):
         impulses = at.contact[1:]
         indentation = jnp.where(opened | closed, 0.0, x)
         contact = jnp.concatenate([indentation, jnp.where(closed, 0.0, impulses)])
-        rows = after
-        if self.mu is not None:  # friction starts anew with the force
-            keeps = loaded(phase) & loaded(after)
-            rows = mode_rows(ContactModes(after, friction._replace(active=keeps)))
-        state = packed(at._replace(contact=contact))
-        # `error_only_rows` stay as they are
-        state = jnp.concatenate([state, y[len(state) :]])
-        return rows[:, None].astype(modes.dtype), state
+        return after, at._replace(contact=contact)
 
     def begins(
         self, before: Int[Array, "k 1"], after: Int[Array, "k 1"]
@@ -379,9 +401,14 @@ def compliant_flow(
     Roundings of margins: SNAP of the tolerance, or velocities that arise within the
     rounding of time; of friction a share of the largest force or slip.
     """
-    system, force, mu, settings, _, _, times, m, _ = problem
+    system = problem.system
+    force = problem.law
+    mu = problem.mu
+    settings = problem.settings
+    times = problem.times
+    m = problem.contacts
     contacts = contacts_at(system, at.q, at.v, at.t, mu is not None)
-    scales = _contact_scales(force, contacts, fastest)
+    scales = contact_scales(force, contacts, fastest)
     axes = None
     by_depth = jnp.full(m, SNAP * settings.rtol, at.q.dtype)
     noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
@@ -435,7 +462,7 @@ def stable_step(
     x = jnp.where(x >= 0, x, 0.0)
     stiffness = jax.jvp(lambda x: force.force(x, rate), (x,), (one,))[1]
     damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))[1]
-    both = jnp.stack([_unloading(force, phase, stiffness), damping], axis=1)
+    both = jnp.stack([unloading(force, phase, stiffness), damping], axis=1)
     both = jnp.where(loaded(phase)[:, None], both, 0.0)
     square, rate = jnp.max(jnp.abs(contacts.delassus[:m, :m]) @ jnp.abs(both), axis=0)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(square), rate))
@@ -444,7 +471,7 @@ def stable_step(
     )
 
 
-def _unloading(
+def unloading(
     force: Force, phase: Int[Array, " m"], rate: Float[Array, " m"]
 ) -> Float[Array, " m"]:
     """`rate` in compression, `rate / e^2` in plastic expansion: of the indentation or

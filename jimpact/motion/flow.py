@@ -92,6 +92,9 @@ class State(NamedTuple):
     # of compliant contacts: indentation [m], then impulses [N s], normal and tangential
     # (none without friction); of rigid ones no rows
     contact: Float[Array, "c m"]
+    # of contacts with tangential springs: elongation xi [m] while they hold, the
+    # direction n while they slide; of others none
+    spring: Float[Array, "b m"] | tuple[()] = ()
 
 
 class Settings(NamedTuple):
@@ -594,7 +597,9 @@ def one_pass(
     jumps = jumps & accept
     event = landed[:-1].at[: len(jumps)].max(jumps)  # another normal is an event, too
     steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
-    vanishes = flies & ~accept & (after.step.length[0, 0] < _smallest_step(targets))
+    shrinks = after.step.length[0, 0] < _smallest_step(targets)
+    # a landing on what is left within rounding is as short, and ends
+    vanishes = flies & ~accept & shrinks & (after.step.lands[0, 0] == 0)
     # what an event or a sample shortens says nothing of the steps after it
     tried = flight.aim.length[0, 0]
     lands = flight.aim.lands[0, 0] > 0

@@ -11,7 +11,11 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from jimpact.core.law import Law
 from jimpact.laws.forces import Force
-from jimpact.motion.compliant_contact import compliant_motion, force_of
+from jimpact.motion.compliant_contact import (
+    compliant_motion,
+    force_of,
+    tangential_stiffness_of,
+)
 from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
 from jimpact.motion.event_driven import empty_checkpoint, event_driven
 from jimpact.motion.flow import Settings
@@ -149,7 +153,9 @@ def simulate(
         jnp.asarray(slow, q.dtype),
     )
     if isinstance(method, ContactForces):
-        arguments = start, force_of(law), settings, count, rows, method.until_apart
+        force = force_of(law)
+        kappa = tangential_stiffness_of(law, start)
+        arguments = start, force, kappa, settings, count, rows, method.until_apart
         return _waited(_forced, arguments, method.progress)
     if _on_host((start, law, settings)):
         if max_events is None:
@@ -222,6 +228,7 @@ def _events(
 def _forced(
     start: Start,
     force: Force,
+    tangential_stiffness: Float[Array, " m"] | None,
     settings: Settings,
     samples: int,
     max_events: int,
@@ -229,6 +236,7 @@ def _forced(
 ) -> Motion:
     """Motion in which contact forces act throughout."""
     problem = _problem(start, force, settings, samples)
+    problem = problem._replace(tangential_stiffness=tangential_stiffness)
     course = compliant_motion(problem, max_events, until_apart)
     return _recorded(start.system, problem.times, course)
 

@@ -45,6 +45,8 @@ class MotionProblem(NamedTuple):
     times: Float[Array, " S"]  # [s] of the samples
     contacts: int  # m
     past: Past | None = None  # where the motion may go on, run after run
+    # kappa of tangential springs in motions by contact forces; None: rigid sticking
+    tangential_stiffness: Float[Array, " m"] | None = None
 
     @property
     def tangents(self) -> int:
