@@ -236,16 +236,12 @@ def cache_folder(no_cache: bool) -> str | None:
 
 
 def _processor() -> str:
-    """A short name for this kind of processor: compiled programs run on no other."""
+    """A short name for this kind of processor."""
     import hashlib
-    import platform
 
-    kind = platform.machine() + platform.processor()
-    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as info:
-        kind += next(
-            (line for line in info if line.startswith(("flags", "Features"))), ""
-        )
-    return hashlib.sha256(kind.encode()).hexdigest()[:8]
+    from jimpact.tools.processor import processor
+
+    return hashlib.sha256(processor().encode()).hexdigest()[:8]
 
 
 def end_on_interrupt(message: Callable[[], str]) -> None:

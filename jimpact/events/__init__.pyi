@@ -6,3 +6,4 @@ from .impact_dynamics import (
     evaluate as evaluate,
     first_indentation as first_indentation,
 )
+from .tangential_spring import QUARTER as QUARTER, Slide as Slide

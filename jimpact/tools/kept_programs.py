@@ -15,7 +15,6 @@ import hashlib
 import importlib
 import os
 import pickle
-import platform
 import re
 import secrets
 import sys
@@ -31,6 +30,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 
 from jimpact.tools.checks import check_kind, needed
+from jimpact.tools.processor import INFO, processor
 
 SUFFIX = ".program"
 # Bytes [B] that the files of a folder may take together; the ones not used for longest
@@ -67,7 +67,6 @@ KNOWN = (
     "functools",
     "collections",
 )
-PROCESSOR = Path("/proc/cpuinfo")  # lists the instruction set
 CALLS = re.compile(r'custom_call_target="([^"]*)"')  # of functions outside of a program
 LAPACK = "lapack_"
 LENGTH = 8  # bytes of the length of a payload
@@ -278,7 +277,7 @@ def keep_programs(folder: str | Path | None = None) -> KeptPrograms:
         check_kind("folder", folder, Path)
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True, mode=0o700)
-    if PROCESSOR.exists():
+    if INFO.exists():
         _keeper[:] = [Keeper(path)]
     else:
         warnings.warn(
@@ -390,18 +389,10 @@ def _ground() -> str:
     for name in ("jax", "jaxlib", "equinox", "numpy"):
         digest.update(f"{name} {importlib.import_module(name).__version__}".encode())
     digest.update(sys.version.encode())
-    digest.update(_processor().encode())
+    digest.update(processor().encode())
     for name in OPTIONS_OF_XLA:
         digest.update(f"{name}={os.environ.get(name)}".encode())
     return digest.hexdigest()
-
-
-def _processor() -> str:
-    """Machine and instruction set of this processor."""
-    info = PROCESSOR.read_text(encoding="utf-8")
-    kinds = ("flags", "Features", "model name", "CPU part")
-    lines = {line for line in info.splitlines() if line.startswith(kinds)}
-    return " ".join([platform.machine(), *sorted(lines)])
 
 
 # ---------------------------------------------------------------------------- files
