@@ -183,7 +183,7 @@ class FrictionFlow(ContactFlow):
         return y[-1 - self.tangents : -1]
 
     def with_tangents(
-        self, y: Float[Array, "n B"], u: Float[Array, "t B"]
+        self, y: Float[Array, "_ B"], u: Float[Array, "t B"]
     ) -> Float[Array, "n B"]:
         """A state without friction, with slip u and no tangential impulse before the
         time.
@@ -199,7 +199,7 @@ class FrictionFlow(ContactFlow):
         return FrictionRows(x, g, p, u, side, time=y[-1:])
 
     def with_slip_modes(
-        self, modes: Int[Array, "modes B"], slip: Int[Array, "m B"]
+        self, modes: Int[Array, "_ B"], slip: Int[Array, "m B"]
     ) -> Int[Array, "modes B"]:
         """The modes with these modes of slip."""
         phase, closings, _ = self.modes(modes)
@@ -210,7 +210,8 @@ class FrictionFlow(ContactFlow):
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state before the impact, from gamma, indentations x and slip u."""
         modes, y = self.start(gamma, x)
-        modes = self.with_slip_modes(modes, jnp.sign(u))
+        sign = jnp.sign(u).astype(modes.dtype)
+        modes = self.with_slip_modes(modes, sign)
         y = self.with_tangents(y, u)
         closed = self.modes(modes).phase != Phase.OPEN
         return self.decided(modes, y, jnp.zeros_like(closed), closed)
@@ -290,8 +291,10 @@ class FrictionFlow(ContactFlow):
     def field(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "n B"]:
-        """Rates of x, g, p, slip, its impulse and time:
-        `g' = ratio (G F + K_nt lambda)`.
+        """Rates of x, g, p, slip u, its impulse and time.
+
+        Equation: `x' = closing g`, `g' = ratio (G F + K_nt lambda)`, and `unit` times
+        F, u' of `forces`, lambda and 1.
         """
         frozen = const.frozen
         forces = self.forces(const, y)

@@ -267,8 +267,11 @@ def flow_of(
     structure: Structure,
     tighten: float = 1.0,
 ) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
-    """The flow of a problem with a batch in the last axis, its first modes and
-    state.
+    """The flow of a problem with a batch in the last axis, its first modes and state.
+
+    It is a `ContactFlow` without friction, a `SpringFlow` with tangential springs, else
+    a `FrictionFlow` in the plane, a `SlipFlow` in space. `tighten` < 1, a factor of the
+    tolerance: for a run with derivatives, which watches exponents that are an array.
     """
     m = problem.omega.shape[0]
     viscous = problem.viscous
@@ -453,6 +456,9 @@ class ImplicitProgram(ImpulseProgram):
     ) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem as `ImplicitSteps`, and their state before the
         impact.
+
+        With friction the coupling is `K = [[G, K_nt], [K_tn, K_tt]]`, and the velocity
+        (gamma, u); without it G and gamma. The tolerance is finer with derivatives.
         """
         coupling = coupling_of(problem, self.structure)
         m = problem.omega.shape[0]

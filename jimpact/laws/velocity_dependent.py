@@ -279,6 +279,9 @@ def make_velocity_dependent(
 ) -> VelocityDependent:
     """`VelocityDependent` from plain parameters, as a study gives them; `base` is a
     law's name.
+
+    Raise a ValueError for a base without a restitution, or that lacks a parameter which
+    is not None.
     """
     if base not in REGISTRY or "restitution" not in REGISTRY[base].arguments:
         known = ", ".join(
