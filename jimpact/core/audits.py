@@ -144,8 +144,7 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
     if approaches.any():
         return (
             "no closed contact approaches (gamma- < 0), only open ones do: laws that "
-            "use gaps are "
-            "Compliant and Binary"
+            "use gaps are Compliant and Binary"
         )
     return (
         "nothing approaches (gamma- < 0 at no contact): is the sign of the "

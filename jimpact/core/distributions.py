@@ -25,8 +25,7 @@ from jimpact.tools.checks import (
 
 OVERLAP = (
     "a negative gap is an overlap, that is a precompressed contact: give LZB the "
-    "energy stored in "
-    "it (`initial_energy`) and leave the gap at 0."
+    "energy stored in it (`initial_energy`) and leave the gap at 0."
 )
 
 
@@ -55,8 +54,7 @@ class Distribution(eqx.Module):
             if np.shape(value) not in ((), (size,)):
                 raise ValueError(
                     f"Argument `{name}` must have scalars or {size} values in "
-                    f"`{field}`, but is "
-                    f"{self!r}."
+                    f"`{field}`, but is {self!r}."
                 )
 
 
@@ -158,8 +156,7 @@ class Normal(Distribution):
         if non_negative and np.any(np.asarray(self.mean) < 0):
             raise ValueError(
                 f"Argument `{name}` is truncated at 0 and must have a mean of at least "
-                f"0, but is "
-                f"{self!r}; {OVERLAP}"
+                f"0, but is {self!r}; {OVERLAP}"
             )
 
 
@@ -204,9 +201,9 @@ class RandomLaw(eqx.Module):
         """
         if isinstance(law, type):
             raise TypeError(
-                "Argument `law` must be a law with its values, as in "
-                "`RandomLaw(LZB(0.9), "
-                f"restitution=Uniform(0.8, 0.9))`, but is the class {law.__name__}."
+                f"Argument `law` must be a law with its values, as in "
+                f"`RandomLaw(LZB(0.9), restitution=Uniform(0.8, 0.9))`, but is the "
+                f"class {law.__name__}."
             )
         check_kind("law", law, Law)
         known = free_parameters_of(law)
@@ -296,9 +293,8 @@ def warn_without_key(name: str, function: Callable[[jax.Array], Any]) -> None:
     if not any(x is key for x in read):
         warnings.warn(
             f"Argument `{name}` draws without its key: it is compiled once, and the "
-            f"same in all "
-            "samples, whatever numpy.random would give. Draw by "
-            "jax.random.uniform(key, ...), say.",
+            f"same in all samples, whatever numpy.random would give. Draw by "
+            f"jax.random.uniform(key, ...), say.",
             stacklevel=2,
         )
 

@@ -196,8 +196,8 @@ def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
     if nothing and not is_traced(stored) and not np.any(stored):
         warnings.warn(
             f"Nothing happens: only open contacts (gap > 0) approach, and "
-            f"{type(law).__name__} "
-            "leaves them out. Laws that use gaps are Compliant and Binary.",
+            f"{type(law).__name__} leaves them out. Laws that use gaps are Compliant "
+            f"and Binary.",
             stacklevel=4,  # the line that calls `impact`, through `full_precision`
         )
 
@@ -339,9 +339,8 @@ def check_constrained(scene: Scene, velocity: jax.Array) -> None:
     if not keeps.all():
         j = int(np.argmin(keeps))
         raise ValueError(
-            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
-            "0, but "
-            f"constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
+            f"Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
+            f"0, but constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
         )
 
 
@@ -477,14 +476,12 @@ def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
         if value is not None and jnp.shape(value) != (size,):
             raise ValueError(
                 f"{name} must return `{part}` of shape ({size},), but returns one of "
-                f"shape "
-                f"{jnp.shape(value)}."
+                f"shape {jnp.shape(value)}."
             )
     if isinstance(impulses.status, int) and impulses.status not in CODE.values():
         raise ValueError(
             f"{name} must return `status` of a row of `ji.STATUS`, below "
-            f"{len(STATUS)}, but "
-            f"returns {impulses.status}."
+            f"{len(STATUS)}, but returns {impulses.status}."
         )
     return impulses._replace(normal=jnp.asarray(impulses.normal))
 

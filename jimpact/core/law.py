@@ -657,8 +657,7 @@ def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
     if getattr(law, "friction", None) is not None and scene.tangents is None:
         raise ValueError(
             f"Argument `scene` must have tangents where {type(law).__name__} has "
-            f"`friction`: "
-            "give Scene(..., tangents=...), or friction=None."
+            f"`friction`: give Scene(..., tangents=...), or friction=None."
         )
     law.check(scene, dtype)
 

@@ -150,8 +150,7 @@ def register(
         if other is not None and _place(other.law) != _place(law):
             raise ValueError(
                 f"Argument `name` must be new, but {name!r} is "
-                f"{other.law.__qualname__} of "
-                f"{other.law.__module__}."
+                f"{other.law.__qualname__} of {other.law.__module__}."
             )
         row = Row(
             law=law,
@@ -168,8 +167,7 @@ def register(
         if simplicity is not None and unknown:
             raise ValueError(
                 f"Argument `simplicity` must be None for a law that needs "
-                f"`{unknown[0]}`: `advise` "
-                f"knows only {', '.join(ADVISED)}."
+                f"`{unknown[0]}`: `advise` knows only {', '.join(ADVISED)}."
             )
         REGISTRY[name] = row
         return law

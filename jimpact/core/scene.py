@@ -375,8 +375,7 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
         if len(numbers) > 1:
             raise ValueError(
                 f"Argument `scenes` must have equally many {what} in all shots, but "
-                f"have "
-                f"{' and '.join(map(str, sorted(numbers)))}."
+                f"have {' and '.join(map(str, sorted(numbers)))}."
             )
     (tangents_each,) = tangents  # of a contact
     counts = [s.contacts for s in scenes]
@@ -709,17 +708,15 @@ def _check_scene(scene: Scene) -> None:
     if normals.ndim != 2 or normals.shape[0] != n or normals.shape[1] == 0:
         raise ValueError(
             f"Argument `normals` must have shape (n, m) with n = {n} as in `mass` and "
-            f"m >= 1, "
-            f"but has shape {normals.shape}."
+            f"m >= 1, but has shape {normals.shape}."
         )
     m = normals.shape[1]
     check_values("normals", normals)
     if not is_traced(normals) and not _has_body(np.asarray(normals)).all():
         contact = int(np.argmin(_has_body(np.asarray(normals)))) + 1
         raise ValueError(
-            "Argument `normals` must have no zero column: such a contact has no body, "
-            "but that of "
-            f"contact {contact} is zero."
+            f"Argument `normals` must have no zero column: such a contact has no body, "
+            f"but that of contact {contact} is zero."
         )
     check_mass(mass)
     if scene.gaps is not None:
@@ -773,19 +770,16 @@ def _check_directions(scene: Scene) -> None:
     if dependent.any():
         warnings.warn(
             f"The normal and tangents of contact {int(np.argmax(dependent)) + 1} "
-            f"depend on each "
-            "other: this is right only if its bodies cannot move in all of these "
-            "directions.",
+            f"depend on each other: this is right only if its bodies cannot move in "
+            f"all of these directions.",
             stacklevel=2,
         )
     elif oblique.any():
         warnings.warn(
             f"The tangents of contact {int(np.argmax(oblique)) + 1} are not at right "
-            f"angles to its "
-            "normal and to each other, and of its length, where the mass matrix looks "
-            "like that "
-            "of a body's position: slip velocities and Coulomb's cone are then "
-            "distorted.",
+            f"angles to its normal and to each other, and of its length, where the "
+            f"mass matrix looks like that of a body's position: slip velocities and "
+            f"Coulomb's cone are then distorted.",
             stacklevel=2,
         )
 
@@ -858,8 +852,7 @@ def _check_independent(constraints: jax.Array) -> None:
     if rank < b:
         raise ValueError(
             f"Argument `constraints` must have independent columns, but {b} columns "
-            f"have "
-            f"rank {rank}."
+            f"have rank {rank}."
         )
 
 

@@ -67,10 +67,8 @@ from jimpact.tools.status import CODE
 GRADIENT_TIGHTENING = 0.01
 NO_SECOND = (
     "Argument `method` must be 'time' for second derivatives, but has value "
-    "'implicit', or 'auto', "
-    "which is 'implicit' for several contacts with friction in space: steps that do "
-    "not end at "
-    "events have first derivatives only."
+    "'implicit', or 'auto', which is 'implicit' for several contacts with friction in "
+    "space: steps that do not end at events have first derivatives only."
 )
 IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost more
 # A contact slower than the fastest by more than this factor sees many of its periods,

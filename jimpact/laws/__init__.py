@@ -88,8 +88,7 @@ register(
     summary="pair collisions one after another, in a given order",
     right_when="gaps well above the indentation, stiffness falling along the chain",
     fails_when="touching equal balls (the striker never reverses), collisions at the "
-    "same instant, "
-    "whose order then decides",
+    "same instant, whose order then decides",
     promises=EVERY_PROPERTY,
     source=(
         "Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)"

@@ -145,18 +145,16 @@ class Binary(Law):
         if missing:
             raise ValueError(
                 f"Argument `order` must name every contact, but contact {missing[0]} "
-                f"is missing "
-                f"in {self.order!r} and could approach forever."
+                f"is missing in {self.order!r} and could approach forever."
             )
         first, *others = self.order
         following = (*others, first)
         twice = any(j == k for j, k in zip(self.order, following))
         if m > 1 and twice:
             raise ValueError(
-                "Argument `order` must not name a contact twice in a row (the last and "
-                "the first "
-                f"follow each other), but has value {self.order!r}: it separates at "
-                f"once."
+                f"Argument `order` must not name a contact twice in a row (the last "
+                f"and the first follow each other), but has value {self.order!r}: it "
+                f"separates at once."
             )
 
     @full_precision

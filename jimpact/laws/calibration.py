@@ -133,16 +133,14 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
     if scale is None:
         raise TypeError(
             f"Argument `force` must have a damping to find, but is {force!r}; a "
-            f"`UserForce` has "
-            "one as the entry 'damping' of a dict of parameters."
+            f"`UserForce` has one as the entry 'damping' of a dict of parameters."
         )
     (damping,) = _each(_damping, force, m, v, e)
     if not isinstance(damping, jax.core.Tracer) and jnp.isnan(damping).any():
         raise ValueError(
-            "Argument `restitution` must be one that the force reaches with a damping "
-            "of up to "
-            f"{STRONGEST / (1 - STRONGEST):.0f} times its scale {scale}, but has value "
-            f"{e}."
+            f"Argument `restitution` must be one that the force reaches with a damping "
+            f"of up to {STRONGEST / (1 - STRONGEST):.0f} times its scale {scale}, but "
+            f"has value {e}."
         )
     return force.with_damping(damping)
 

@@ -125,19 +125,17 @@ class Compliant(Law):
         viscous = self.force.bistiffness is None
         if self.tangential_stiffness is not None and viscous:
             raise ValueError(
-                "Argument `tangential_stiffness` must be None with a force that "
-                "depends on the "
-                "rate of indentation, as k_t = kappa dF/dx(x), but the force is "
-                f"{self.force!r}: PowerLaw, LinearSpring, Hertz and Bistiffness have "
-                f"it."
+                f"Argument `tangential_stiffness` must be None with a force that "
+                f"depends on the rate of indentation, as k_t = kappa dF/dx(x), but the "
+                f"force is {self.force!r}: PowerLaw, LinearSpring, Hertz and "
+                f"Bistiffness have it."
             )
         if viscous or yields:
             check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
         if yields and (self.friction is not None or self.method == "implicit"):
             raise ValueError(
-                "Argument `force` must not yield with friction or method 'implicit', "
-                "but has value "
-                f"{self.force!r}."
+                f"Argument `force` must not yield with friction or method 'implicit', "
+                f"but has value {self.force!r}."
             )
 
     @property
@@ -284,9 +282,8 @@ def make_compliant(
     check_choice("rheology", rheology, RHEOLOGIES)
     if (rheology == "bistiffness") != (damping is None):
         raise ValueError(
-            "Argument `damping` must be given for a viscous rheology and only there, "
-            "but "
-            f"`rheology` is {rheology!r} and `damping` has value {damping!r}."
+            f"Argument `damping` must be given for a viscous rheology and only there, "
+            f"but `rheology` is {rheology!r} and `damping` has value {damping!r}."
         )
     if rheology == "bistiffness":
         force: Force = Bistiffness(stiffness, exponent, restitution)

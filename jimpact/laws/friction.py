@@ -25,9 +25,9 @@ def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, An
         np.asarray(tangential_restitution) != 0
     ):
         raise ValueError(
-            "Argument `tangential_restitution` must be 0 without `friction`: then "
-            "nothing acts "
-            f"along the contacts, but has value {tangential_restitution!r}."
+            f"Argument `tangential_restitution` must be 0 without `friction`: then "
+            f"nothing acts along the contacts, but has value "
+            f"{tangential_restitution!r}."
         )
     return None, None
 

@@ -98,9 +98,8 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     force = law.contact_force
     if force is None:
         raise TypeError(
-            "Argument `law` must have a `contact_force`, by which its contacts indent "
-            "(Compliant, "
-            f"LZB), but is {law!r}."
+            f"Argument `law` must have a `contact_force`, by which its contacts indent "
+            f"(Compliant, LZB), but is {law!r}."
         )
     check_law(law, scene, v.dtype)
     speed = jnp.maximum(jnp.max(-gap_velocity(scene, v)), 0.0)

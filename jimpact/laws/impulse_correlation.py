@@ -92,8 +92,8 @@ class ImpulseCorrelation(Law):
             if not smallest <= ratio[i, j] <= largest:
                 raise ValueError(
                     f"Argument `ratio` must lie in [{low[i, j]:.6g}, {high[i, j]:.6g}] "
-                    f"for contact "
-                    f"{j} beside contact {i}, but has value {ratio[i, j]:.6g}."
+                    f"for contact {j} beside contact {i}, but has value "
+                    f"{ratio[i, j]:.6g}."
                 )
 
     @full_precision

@@ -277,9 +277,8 @@ class RestitutionMatrix(Kinematic):
         shape = np.shape(matrix)
         if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
             raise ValueError(
-                "Argument `matrix` must be square, (m, m) for m contacts or (m + k, m "
-                "+ k) with "
-                f"k tangential quasi-velocities, but has shape {shape}."
+                f"Argument `matrix` must be square, (m, m) for m contacts or (m + k, m "
+                f"+ k) with k tangential quasi-velocities, but has shape {shape}."
             )
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
@@ -303,8 +302,7 @@ class RestitutionMatrix(Kinematic):
         if self.friction is not None:
             raise ValueError(
                 f"Argument `matrix` must have shape ({m}, {m}) with `friction`, which "
-                f"decides "
-                f"about the tangential velocities itself, but has shape "
+                f"decides about the tangential velocities itself, but has shape "
                 f"{self.matrix.shape}."
             )
         if scene.constraints is None:
@@ -319,8 +317,7 @@ class RestitutionMatrix(Kinematic):
                 other = ""
             raise ValueError(
                 f"Argument `matrix` must have shape ({m}, {m}){other} for {m} contacts "
-                f"and "
-                f"{full} free velocities, but has shape {self.matrix.shape}."
+                f"and {full} free velocities, but has shape {self.matrix.shape}."
             )
         if scene.tangents is None:
             raise ValueError(
@@ -332,8 +329,8 @@ class RestitutionMatrix(Kinematic):
         if gaps is not None and not is_traced(gaps) and np.any(np.asarray(gaps) > 0):
             raise ValueError(
                 "Argument `scene` must have closed contacts only for a `matrix` with "
-                "tangential "
-                "blocks: which quasi-velocities are tangential depends on the contacts."
+                "tangential blocks: which quasi-velocities are tangential depends on "
+                "the contacts."
             )
         check_independent(scene)
 

@@ -106,9 +106,8 @@ def check_few_contacts(scene: Scene) -> None:
     if scene.contacts > MOST_WITH_FRICTION:
         raise ValueError(
             f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for "
-            f"impact dynamics "
-            f"with friction, but has {scene.contacts}: algebraic laws such as Moreau "
-            f"take more."
+            f"impact dynamics with friction, but has {scene.contacts}: algebraic laws "
+            f"such as Moreau take more."
         )
 
 
@@ -128,14 +127,12 @@ def check_spring(law: Any) -> None:  # law: LZB, Compliant
     if law.friction is None:
         raise ValueError(
             "Argument `friction` must be given with `tangential_stiffness`, whose "
-            "force mu limits, "
-            "but has value None."
+            "force mu limits, but has value None."
         )
     if law.method == "implicit":
         raise ValueError(
             "Argument `method` must be 'time' or 'auto' with `tangential_stiffness`, "
-            "but has value "
-            "'implicit': its steps know contacts that stick rigidly."
+            "but has value 'implicit': its steps know contacts that stick rigidly."
         )
 
 

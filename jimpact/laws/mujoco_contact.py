@@ -165,10 +165,9 @@ def mujoco_solref(
     if excess(ends[1]) > 0.0:
         raise ValueError(
             f"Argument `restitution` must be at least "
-            f"{restitution + excess(ends[1]):.3g} with "
-            f"timestep={timestep:g} and duration={duration:g}, but has value "
-            f"{restitution:g}: give "
-            "a shorter timestep or a longer duration."
+            f"{restitution + excess(ends[1]):.3g} with timestep={timestep:g} and "
+            f"duration={duration:g}, but has value {restitution:g}: give a shorter "
+            f"timestep or a longer duration."
         )
     return -stiffness, -float(brentq(excess, *ends))
 
@@ -200,9 +199,8 @@ def _stiffness_and_damping(
     if first < 0 and second <= 0:
         return -first / largest**2, -second / largest
     raise ValueError(
-        "Argument `solref` must be (timeconst, dampratio), both > 0, or (-stiffness, "
-        "-damping), "
-        f"but has value ({first:g}, {second:g})."
+        f"Argument `solref` must be (timeconst, dampratio), both > 0, or (-stiffness, "
+        f"-damping), but has value ({first:g}, {second:g})."
     )
 
 
@@ -274,6 +272,5 @@ def _restitution(
         r = np.where(in_contact, r + timestep * v, r)
     raise ValueError(
         f"Argument `timestep` must be longer: with value {timestep:g} the contact "
-        f"lasts more than "
-        f"{_MOST_STEPS} steps."
+        f"lasts more than {_MOST_STEPS} steps."
     )

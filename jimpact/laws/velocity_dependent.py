@@ -49,9 +49,8 @@ def _curve(value: Any) -> Any:
     is_table = len(columns) == 2 and len(set(shapes)) == 1 and columns[0].ndim == 1
     if not is_table or len(columns[0]) < 2:
         raise ValueError(
-            "Argument `curve` must be a function of the speed, or (speeds, values) of "
-            "two or more "
-            f"rows, but has shapes {shapes}."
+            f"Argument `curve` must be a function of the speed, or (speeds, values) of "
+            f"two or more rows, but has shapes {shapes}."
         )
     speeds, values = columns
     check_values("curve", speeds, low=0.0)
@@ -135,9 +134,8 @@ class VelocityDependent(Law):
         restitution = free_parameters_of(self.law).get("restitution")
         if restitution is None or np.ndim(restitution.value) > 1:
             raise TypeError(
-                "Argument `law` must have `restitution`, one number or one per "
-                "contact, but is "
-                f"{type(self.law).__name__}."
+                f"Argument `law` must have `restitution`, one number or one per "
+                f"contact, but is {type(self.law).__name__}."
             )
         if self.curve is not None and self.speed_exponent is not None:
             raise ValueError(
@@ -219,8 +217,7 @@ def _check_function(curve: Callable[[Any], Any]) -> None:
     if values.shape != speeds.shape:
         raise ValueError(
             f"Argument `curve` must give an array of the shape of the speeds, "
-            f"{speeds.shape}, but "
-            f"gives {values.shape}."
+            f"{speeds.shape}, but gives {values.shape}."
         )
     check_values("curve", values, low=0.0)
 
