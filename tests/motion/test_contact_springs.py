@@ -187,3 +187,30 @@ def test_a_box_that_strikes_on_its_corners_agrees_with_radau():
     )
     wrong = moved(ji.System(box, gravity=True), other, q, SPEED, 0.08, max_events=200)
     assert np.abs(wrong.velocity[-1] - exact).max() > 1e-2
+
+
+@pytest.mark.release
+def test_derivatives_of_a_box_with_springs_agree_with_differences():
+    """Along mu, kappa, e and k at once, of springs that hold, slide and drag."""
+    turn = np.array(TURN) / np.linalg.norm(TURN)
+    q = np.array([0.0, 0.0, 0.075, *turn])
+    system = ji.System(ji.Box(SIZE, mass=MASS), gravity=True)
+
+    def run(change):
+        force = ji.Bistiffness(STIFFNESS * (1 + change), 1.0, 0.7 + change)
+        law = ji.Compliant(
+            force, friction=MU + change, tangential_stiffness=KAPPA + change
+        )
+        return moved(system, law, q, SPEED, 0.045).velocity[-1]
+
+    def with_slope(change):
+        return jax.jvp(run, (change,), (jnp.ones_like(change),))
+
+    both = jax.jit(with_slope)
+    _, slope = both(jnp.asarray(0.0))
+    step = 1e-5
+    above, _ = both(jnp.asarray(step))
+    below, _ = both(jnp.asarray(-step))
+    difference = (above - below) / (2 * step)
+    size = float(jnp.max(jnp.abs(slope)))
+    np.testing.assert_allclose(slope, difference, atol=1e-6 * size)
