@@ -152,6 +152,20 @@ def test_a_ball_bounces_as_by_an_impact(speed):
     assert side <= 0.3 * float(motion.events.impulse[lifted, 0]) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("speed", [0.3, 1.5, 8.0])
+def test_a_disc_bounces_as_by_an_impact(speed):
+    """In the plane, with e < 1; it may slide from the first instant of the motion."""
+    force = ji.Bistiffness(1e6, 1.5, 0.8)
+    law = ji.Compliant(force, friction=0.3, tangential_stiffness=0.8)
+    disc = ji.Disc(0.1, MASS)
+    q = np.array([0.0, 0.1, 0.0])
+    v = np.array([speed, -1.0, 0.5])
+    motion = moved(ji.System(disc), law, q, v, 0.02, samples=2)
+    assert ji.STATUS[int(motion.status)].name == "ok"
+    out = ji.impact(law, disc.scene(q), v)
+    np.testing.assert_allclose(motion.velocity[-1], out.velocity, atol=2e-6)
+
+
 def test_springs_are_refused_where_tangents_turn():
     balls = ji.Bodies([ji.Sphere(0.1), ji.Sphere(0.1)], pairs=[(0, 1)])
     law = ji.Compliant(ji.Hertz(1e7), friction=0.3, tangential_stiffness=0.8)
