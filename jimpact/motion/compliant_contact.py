@@ -52,8 +52,8 @@ from jimpact.motion.record import KIND_CODE
 from jimpact.motion.run import course_of, end_of, goes_on
 from jimpact.motion.spring_flow import (
     margins_of_springs,
-    rows_at_start,
     spring_flow,
+    springs_at_start,
 )
 from jimpact.motion.start import Start
 from jimpact.motion.tables import (
@@ -121,20 +121,15 @@ def force_of(law: Law) -> Force:
 
 def tangential_stiffness_of(law: Law, start: Start) -> Float[Array, " m"] | None:
     """kappa (m,) of the law's tangential springs in a motion by contact forces, or
-    None.
+    None, also where no contact has friction.
 
     Raises:
-        ValueError: springs without friction, or of bodies whose tangents turn while
-            they touch: springs would turn with them.
+        ValueError: springs of bodies whose tangents turn while they touch: springs
+            would turn with them.
     """
     kappa = getattr(law, "tangential_stiffness", None)
-    if kappa is None:
+    if kappa is None or start.friction is None:  # no spring, or all below mu = 0
         return None
-    if start.friction is None:
-        raise ValueError(
-            "Argument `friction` must be given with `tangential_stiffness`, whose "
-            "springs hold below mu F."
-        )
     body = start.system.body
     if start.in_space and isinstance(body, Bodies) and _touch_each_other(body):
         raise ValueError(
@@ -221,7 +216,7 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     if mu is not None:
         fastest = jnp.concatenate([fastest, slip])
     if problem.tangential_stiffness is not None:
-        rows = rows_at_start(problem, state, phase)
+        rows, state = springs_at_start(problem, state, phase, fastest)
         margins = margins_of_springs(problem)
     elif mu is not None:
         rows = mode_rows(ContactModes(phase, no_modes(m, x.dtype)))

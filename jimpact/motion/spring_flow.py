@@ -275,12 +275,15 @@ class SpringMotionFlow(CompliantFlow):
         at = unpacked(self.like, y)
         const = self.constants(modes)
         m = len(const.slide)
-        fired = which[2 * m : 3 * m, 0]
+        _, _, fired, *dragging = which[:-1, 0].reshape(-1, m)  # the last: a sample
         toggled = jnp.zeros_like(fired)
-        if len(at.spring) == 2:
-            toggled = which[3 * m : 4 * m, 0] & ~fired
+        for ended in dragging:  # in space
+            toggled = ended & ~fired
         contacts, force = self.contact_forces(const, at)
         n = self.directions(const, at, contacts, force.normal)
+        assert contacts.tangent is not None
+        u = by_contact(contacts.tangent.rate, m)
+        n = jnp.where(length(n)[:, None] > 0, n, direction(u))  # xi = 0 yet
         holds = const.slide == Slide.HOLDS
         x = at.contact[0]
         stopped = fired & ~holds
@@ -356,11 +359,9 @@ def steepness(force: Force, kappa: Float[Array, " m"]) -> Float[Array, " m"]:
 
 def spring_modes(modes: Int[Array, "k 1"], like: State) -> SpringModes:
     """Phases and modes of springs from their rows (m each)."""
-    m = like.contact_work.shape[1]
-    phase = modes[:m, 0]
-    slide = modes[m:, 0]
+    phase, slide = modes[:, 0].reshape(2, -1)
     acts = loaded(phase)
-    friction = Modes(acts, slide == Slide.HOLDS, jnp.ones(m, like.q.dtype))
+    friction = Modes(acts, slide == Slide.HOLDS, jnp.ones_like(like.contact[0]))
     return SpringModes(phase, friction, slide)
 
 
@@ -371,11 +372,26 @@ def margins_of_springs(problem: MotionProblem) -> int:
     return 3 * problem.contacts
 
 
-def rows_at_start(
-    problem: MotionProblem, at: State, phase: Int[Array, " m"]
-) -> Int[Array, " rows"]:
-    """Rows of the modes where the motion begins: springs hold."""
-    return jnp.concatenate([phase, jnp.full_like(phase, Slide.HOLDS)])
+def springs_at_start(
+    problem: MotionProblem,
+    at: State,
+    phase: Int[Array, " m"],
+    fastest: Float[Array, " s"],
+) -> tuple[Int[Array, " rows"], State]:
+    """Rows of the modes and the state where the motion begins.
+
+    Springs hold with xi = 0; those of contacts that close just then, at x = 0, as
+    `SpringMotionFlow.closed` says.
+    """
+    holds = jnp.full_like(phase, Slide.HOLDS)
+    rows = jnp.concatenate([phase, holds])
+    flow = spring_flow(problem, at, rows[:, None], fastest)
+    contacts = flow.contacts(at)
+    x = at.contact[0]
+    closes = loaded(phase) & (x <= 0)
+    slide, spring = flow.closed(closes, contacts, x, holds, springs(at))
+    spring = jnp.where((slide == Slide.DRAGS)[:, None], 0.0, spring)
+    return jnp.concatenate([phase, slide]), at._replace(spring=spring.T)
 
 
 def spring_flow(

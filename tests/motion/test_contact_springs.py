@@ -152,6 +152,20 @@ def test_a_ball_bounces_as_by_an_impact(speed):
     assert side <= 0.3 * float(motion.events.impulse[lifted, 0]) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("speed", [0.3, 1.5, 8.0])
+def test_a_disc_bounces_as_by_an_impact(speed):
+    """In the plane, with e < 1; it may slide from the first instant of the motion."""
+    force = ji.Bistiffness(1e6, 1.5, 0.8)
+    law = ji.Compliant(force, friction=0.3, tangential_stiffness=0.8)
+    disc = ji.Disc(0.1, MASS)
+    q = np.array([0.0, 0.1, 0.0])
+    v = np.array([speed, -1.0, 0.5])
+    motion = moved(ji.System(disc), law, q, v, 0.02, samples=2)
+    assert ji.STATUS[int(motion.status)].name == "ok"
+    out = ji.impact(law, disc.scene(q), v)
+    np.testing.assert_allclose(motion.velocity[-1], out.velocity, atol=2e-6)
+
+
 def test_springs_are_refused_where_tangents_turn():
     balls = ji.Bodies([ji.Sphere(0.1), ji.Sphere(0.1)], pairs=[(0, 1)])
     law = ji.Compliant(ji.Hertz(1e7), friction=0.3, tangential_stiffness=0.8)
@@ -187,3 +201,30 @@ def test_a_box_that_strikes_on_its_corners_agrees_with_radau():
     )
     wrong = moved(ji.System(box, gravity=True), other, q, SPEED, 0.08, max_events=200)
     assert np.abs(wrong.velocity[-1] - exact).max() > 1e-2
+
+
+@pytest.mark.release
+def test_derivatives_of_a_box_with_springs_agree_with_differences():
+    """Along mu, kappa, e and k at once, of springs that hold, slide and drag."""
+    turn = np.array(TURN) / np.linalg.norm(TURN)
+    q = np.array([0.0, 0.0, 0.075, *turn])
+    system = ji.System(ji.Box(SIZE, mass=MASS), gravity=True)
+
+    def run(change):
+        force = ji.Bistiffness(STIFFNESS * (1 + change), 1.0, 0.7 + change)
+        law = ji.Compliant(
+            force, friction=MU + change, tangential_stiffness=KAPPA + change
+        )
+        return moved(system, law, q, SPEED, 0.045).velocity[-1]
+
+    def with_slope(change):
+        return jax.jvp(run, (change,), (jnp.ones_like(change),))
+
+    both = jax.jit(with_slope)
+    _, slope = both(jnp.asarray(0.0))
+    step = 1e-5
+    above, _ = both(jnp.asarray(step))
+    below, _ = both(jnp.asarray(-step))
+    difference = (above - below) / (2 * step)
+    size = float(jnp.max(jnp.abs(slope)))
+    np.testing.assert_allclose(slope, difference, atol=1e-6 * size)
