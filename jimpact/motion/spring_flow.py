@@ -207,11 +207,13 @@ class SpringMotionFlow(CompliantFlow):
     def sizes_of_springs(self, at: State) -> list[Float[Array, " m"]]:
         """Sizes of the rows of springs, of which a step may err by `rtol`.
 
-        Those of contacts that hold: r of the deepest indentation; of those that slide,
-        where n errs by forces alone, 1 over the share of the indentation now.
+        Those of contacts that hold: r of the deepest indentation, without friction that
+        indentation; of those that slide, where n errs by forces alone, 1 over the share
+        of the indentation now.
         """
         modes = self.slide_of_start
-        scale = self.limit(self.scales.depth)
+        depth = self.scales.depth
+        scale = jnp.where(self.coulomb > 0, self.limit(depth), depth)
         share = jnp.clip(at.contact[0] / self.scales.depth, self.rtol, 1.0)
         size = jnp.where(modes == Slide.HOLDS, scale, 1 / share)
         return [size] * len(at.spring)
