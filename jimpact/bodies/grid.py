@@ -133,6 +133,10 @@ def least_radius(bodies: Pile) -> jax.Array:
 def crowd_of_cells(bodies: Pile) -> int:
     """Most bodies in a row of three cells; 0: radii are traced, or all pairs are less
     work.
+
+    A body looks for partners among `crowd` bodies in each of `rows` rows of cells, half
+    of those around it, so that each pair is found once; of all pairs half as many as
+    there are bodies are its own.
     """
     if is_traced((bodies.points, bodies.rims)):
         return 0

@@ -531,10 +531,11 @@ class Coin(_SpatialBody):
         )
         across = (3 * radius**2 + thickness**2) / 12
         homogeneous = jnp.stack([across, across, 0.5 * radius**2])
-        shape = Shape(
-            tuple(range(len(points))), len(points), faces=False, centred=False
-        )
-        self._make(points, mass, inertia, homogeneous, None, normal, shape)
+        # on edge it does not look the same from all sides: not `centred`
+        corner_numbers = tuple(range(len(points)))
+        shape = Shape(corner_numbers, len(points), faces=False, centred=False)
+        in_the_middle = None  # the centre of mass
+        self._make(points, mass, inertia, homogeneous, in_the_middle, normal, shape)
 
     def _rims(self, outward: jax.Array) -> jax.Array:
         """Points (2 k, 3) of both rims in the directions `outward` (k, 2) from the

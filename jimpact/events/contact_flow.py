@@ -695,10 +695,17 @@ class ContactFlow(Flow):
     ) -> tuple[Int[Array, "m B"], Contacts]:
         """Phases and rows after events of forces that last as long as the indentation.
 
-        OPEN closes to COMPRESSION, with gaps at x = 0. COMPRESSION turns to EXPANSION
-        at g = 0, or to OPEN at x = 0 where what is left in it would do nothing more;
-        with a limit it goes on to YIELD at x = limit, and YIELD to EXPANSION at g = 0.
-        EXPANSION ends OPEN at x = 0, with gamma = e g, or in COMPRESSION at g = 0.
+            phase        event                next phase   set
+            OPEN         by_x or by_g         COMPRESSION  x = 0 with gaps
+            COMPRESSION  g = 0                EXPANSION    g = 0
+            COMPRESSION  g = 0, idle          OPEN         g = 0, x = 0
+            COMPRESSION  x = limit            YIELD        x = limit
+            YIELD        g = 0                EXPANSION    g = 0
+            EXPANSION    x = 0                OPEN         g = e g, x = 0
+            EXPANSION    g = 0                COMPRESSION  g = 0
+
+        Idle are contacts whose energy `x^(eta + 1)` is below (NEGLIGIBLE tolerance)^2,
+        so that they would do nothing more.
         """
         x, g, p = rows
         opened = by_x & (phase == Phase.EXPANSION)

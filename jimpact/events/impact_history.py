@@ -118,6 +118,7 @@ class HistoryProgram:
             step.
             """
             fraction, state, modes, clock = sample
+            # of time in the flow's own time
             rate = flow.contact_states(modes, state).rate
             since = fraction * time_of(end.reached) - time_of(state)
             ahead = quotient(since, rate, where=rate > 0)

@@ -169,8 +169,11 @@ def run(
 def _finished(
     flow: Any, gamma: Float[Array, "m B"], last: _OnItsWay, inspect: Inspect
 ) -> ImpactEnd:
-    """The end of the impact; the flow finishes the state where it has ended by
-    itself.
+    """The end of the impact.
+
+    Where the flow is over its state is `flow.finished`; where a state has returned as a
+    part of itself (`rest.ended`, if cycles are looked for) it is `flow.settled`, the
+    limit of the cycle; elsewhere, paused or given up, it stays as it is.
     """
     carry, rest, seen = last
     over = (carry.mark == Mark.OVER) & ~rest.ended

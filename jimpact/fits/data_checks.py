@@ -234,7 +234,7 @@ class DataBalances:
         Excesses over their standard errors (of a sigma of 1 m/s) scatter by the noise
         about their median; the noise is the root mean square of `_shorter_half` of
         energy and momenta, which outliers hardly change. The limit is that of Student's
-        t.
+        t above the median, and at least that of the noise above 0 at DEFECT_LEVEL.
         """
         groups = [gains, *self.momenta.values()]
         values = [

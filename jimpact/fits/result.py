@@ -373,17 +373,18 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             )
 
     def _noise_of(self, sigma: Any) -> np.ndarray:
-        """Standard errors of measured velocities: sigma, stretched as in the fit; None:
-        of the fit.
+        """Standard errors of measured velocities: `sigma` stretched as in the fit.
 
-        The latter are the root mean squares (n,) over its shots.
+        A fit without sigma stretches nothing, as its `noise` is a velocity; that of a
+        fit with sigma is the factor. None: the errors of the fit, root mean squares
+        (n,) over its shots.
         """
         if sigma is not None:
             if self.problem.sigma is None:
-                stretched = 1.0
+                stretch = 1.0
             else:
-                stretched = self.noise
-            return stretched * np.asarray(sigma, float)
+                stretch = self.noise
+            return stretch * np.asarray(sigma, float)
         weight = np.ma.masked_equal(
             np.asarray(self.problem.measurement.weight, float), 0.0
         )

@@ -411,7 +411,8 @@ def _correlated(
     presses.
 
     They grow in constant ratios, `pbar = s d`: d_i = 1 at the chosen contact i (True in
-    (m,)), `d_j = r_j sqrt(W_jj / W_ii)`, r = `ratio`, at contacts beside it that it
+    (m,)), `d_j = r_j sqrt(W_jj / W_ii)`, r = `ratio` (m,), or its row i of (m, m), at
+    contacts beside it that it
     presses and that do not separate, 0 elsewhere. With a = G d contact j is compressed
     while `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
     `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)` is that of kinetic energy:
@@ -493,9 +494,11 @@ def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array
         s_3 = c (1 + e_k) s_2 - e_j s_1,
 
     two steps of which have trace `c^2 (1 + e_1) (1 + e_2) - e_1 - e_2` and determinant
-    e_1 e_2. They stay positive iff both eigenvalues are (z >= 1, c > 0) and s_3 / s_1
-    is not below the smaller one, `chi(lambda) = lambda^2 - trace lambda + det = 0`. The
-    limit is gamma = 0.
+    e_1 e_2. They stay positive iff both eigenvalues are (c > 0, trace >= 2 sqrt(det))
+    and s_3 / s_1 is not below the smaller one,
+    `chi(lambda) = lambda^2 - trace lambda + det = 0`. The limit is gamma = 0. Redundant
+    contacts (c = 1) have a series instead, `s_3 = e_1 e_2 s_1`, without a limit where
+    e_1 e_2 = 1: then they do not count as endless.
     """
     e = jnp.broadcast_to(inputs.restitution, (2,))
     qn = inputs.qn

@@ -485,11 +485,15 @@ def _axis_values(
     axes: Mapping[str, Sequence[float]] | None, r: int, names: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
     """Values of the axes to map by name: `axes`, sorted, or by default r values of
-    all.
+    all; a ValueError for no axis.
     """
     if axes is None:
         return default_axes(r, names)
-    axes = _checked("axes", axes or {"": ()}, names)  # no axis at all is an error
+    if not axes:
+        raise ValueError(
+            f"Argument `axes` must name one of {', '.join(names)} or more."
+        )
+    axes = _checked("axes", axes, names)
     return {
         name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes
     }

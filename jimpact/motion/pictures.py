@@ -62,7 +62,8 @@ def motion(
 
     Each unit has axes of its own. Curves go through the states before and after every
     event, so that a jump stands upright at its time. Of more than six curves a panel
-    shows the six that move most, of more than six contacts those with the most events;
+    shows the six that move most (all of the `bodies` that are given), of more than six
+    contacts those with the most events;
     its legend says of how many. The potential energy counts from its least value. What
     moves by rounding only is a flat line.
 
@@ -106,11 +107,9 @@ def motion(
         zip(columns, (course.q, course.v), strict=True)
     ):
         for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
-            if bodies is None:
-                count = len(which)
-            else:
-                count = 0
-            if count > _FEW:
+            count = len(which)
+            too_many = bodies is None and count > _FEW
+            if too_many:
                 which = _largest(which, [_range(values[:, i]) for i, _ in which])
             at, words = zip(*which, strict=True)
             axes.plot(course.time, values[:, at], label=words)
@@ -124,7 +123,7 @@ def motion(
             _finish_panel(
                 axes,
                 scales.get(unit, 1.0),
-                f"{_FEW} of {count}" if count > _FEW else "",
+                f"{_FEW} of {count}" if too_many else "",
             )
         for axes in panels[len(units) : -1, j]:
             axes.remove()

@@ -480,15 +480,16 @@ def _chunk_of(function: Any, arrays: Arrays) -> int:
     More for a function that `queues`, where the batch is large or there is friction,
     with which some impacts take many times the steps of others.
     """
-    tangents = isinstance(function, _WithTangents | _WithJacobian)
+    differentiated = isinstance(function, _WithTangents | _WithJacobian)
     while isinstance(function, _WithTangents | _WithJacobian):
         function = function.function
     large = sum(x.size for x in arrays) >= QUEUE_FROM
+    # `tangents` of a program are its tangential impulses
     if getattr(function, "queues", False) and (large or function.tangents > 0):
-        if tangents:
+        if differentiated:
             return QUEUE_WITH_TANGENTS
         return QUEUE
-    if tangents:
+    if differentiated:
         return CHUNK_WITH_TANGENTS
     return CHUNK
 

@@ -118,13 +118,15 @@ class Arcs:
     def changed(self, change: np.ndarray) -> "Arcs":
         """Arcs after a change (N,) of the unknowns."""
         count, n = self.places.shape
-        ends = change[: count * self.size].reshape(count, self.size)
+        of_ends, common = np.split(change, [count * self.size])
+        ends = of_ends.reshape(count, self.size)
+        places, instants, own = np.split(ends, [n, n + 1], axis=1)
         return replace(
             self,
-            instants=self.instants + ends[:, n],
-            places=self.places + ends[:, :n],
-            own=self.own + ends[:, n + 1 :],
-            flight=self.flight.moved(change[count * self.size :]),
+            instants=self.instants + instants[:, 0],
+            places=self.places + places,
+            own=self.own + own,
+            flight=self.flight.moved(common),
         )
 
     def ends(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -39,8 +39,9 @@ def with_clock(arcs: Arcs, frames: Frames) -> tuple[Frames, float]:
 
     Equation: with residuals r and velocities v in sigma their variance is `a (1 + b
     v^2)`; b by the likelihood, a its best for each b, `d^2 = a b`, if this saves
-    LEAST_SAVED and BIC's price. Errors of frames are `sqrt(a (1 + b v^2))` of sigma,
-    without waves.
+    LEAST_SAVED and BIC's price. What is searched is `log(b max v^2)`, twice that of the
+    ratio of d v to sigma. Errors of frames are `sqrt(a (1 + b v^2))` of sigma, those of
+    coordinates with waves sigma itself.
     """
     speed = velocities(arcs, frames) / arcs.errors.sigma
     square = speed**2
@@ -53,7 +54,7 @@ def with_clock(arcs: Arcs, frames: Frames) -> tuple[Frames, float]:
     x = x / x.max()
 
     def cost(log_ratio: float) -> float:
-        """-2 log likelihood at b, a at its best."""
+        """-2 log likelihood at `log(b max v^2)`, a at its best; x is v^2 / max v^2."""
         spread = 1 + np.exp(log_ratio) * x
         return float(len(y) * np.log(np.mean(y / spread)) + np.log(spread).sum())
 
