@@ -126,7 +126,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
       one.
     - `[law.bounds]`: pairs, as `restitution = [0, 1]` or `"restitution[2]" = [0.5, 1]`.
     - `[law.priors]`: means with standard deviations, as `restitution = [0.9, 0.02]`,
-    see `fit`.
+      see `fit`.
     - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed,
       max_steps, profiles.
     - `[data]`: file (relative to the study, see `read_experiments`),
@@ -139,7 +139,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
       acceleration or drag is None; of a body near_m; label of the shots, doubtful. The
       study's `track` holds the impacts.
     - `[bounces]`, in the place of `[data]`: times, sigma, gravity, see
-    `ji.tracks.bounce_times`.
+      `ji.tracks.bounce_times`.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.
 

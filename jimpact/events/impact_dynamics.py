@@ -4,8 +4,8 @@ units.
 With Q the largest normalized approach velocity (or stored energy) of the impact,
 contact j has
 
-    x_ref,j = ((eta_j + 1) Q^2 / (2 k_j))^(1 / (eta_j + 1)),   t_ref,j = x_ref,j / (Q
-    sqrt(W_jj))
+    x_ref,j = ((eta_j + 1) Q^2 / (2 k_j))^(1 / (eta_j + 1)),
+    t_ref,j = x_ref,j / (Q sqrt(W_jj))
 
 and omega_j = T / t_ref,j with T the smallest t_ref: the flow of `contact_flow.py`.
 """

@@ -7,8 +7,8 @@ form, with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_
 
     x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j
     gamma = gamma- + G p + K_nt p_t,   u = u- + K_tn p + K_tt p_t
-    p_t,j' = -mu_j F_j u_j / sqrt(|u_j|^2 + s_j^2)        (friction, regularized below a
-    slip s)
+    p_t,j' = -mu_j F_j u_j / sqrt(|u_j|^2 + s_j^2)
+                                          (friction, regularized below a slip s)
 
 None of them looks for events: x_j is only clamped at 0, or the step-size control has to
 find the changes of phase. A change of phase within a fixed step costs O(step^2),

@@ -94,9 +94,8 @@ def simulate(
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its
-            status.
-        Methods 'events' and 'contact_forces' have derivatives in both modes (grad, jvp,
-        hessian) of everything in it, event times and accumulated works included, in all
+        status. Methods 'events' and 'contact_forces' have derivatives in both modes
+        (grad, jvp, hessian) of everything in it, event times and accumulated works included, in all
         arrays, also those captured by the system's functions. They hold for the order
         of events that occurs: one-sided where two events change places or a contact is
         grazed; NaN of what a motion does not reach.

@@ -3,8 +3,7 @@ located.
 
 One step of length h (after Remark 6.9 of Brogliato):
 
-    q_m = q + h/2 v                              closed: here, or at the end by forces
-    alone
+    q_m = q + h/2 v      closed contacts: here, or at the end by forces alone
     v'  = v + h M^-1 F + M^-1 (N p + H p_t)      0 <= p _|_ gamma' + w >= 0
     q'  = q_m + h/2 v'                           p_t in -mu p Sgn(u' + w_t)
 

@@ -16,8 +16,8 @@ WHICH ONE
     pseudoinverse           the same, with the least forces
     singular_values,        one matrix whose rank is asked for
     eigenvectors
-    elsewhere               `sparse.conjugate_gradients` for packings, `tridiagonal.py`
-    for chains
+    elsewhere               `sparse.conjugate_gradients` for packings,
+                            `tridiagonal.py` for chains
 
 LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in
 batches, loops of our own do, up to `_BY_LOOP` rows.
@@ -31,14 +31,12 @@ Velocities never depend on the choice; it decides which contact reaches its fric
 cone first:
 
     sticking contacts, in the plane   in proportion to mu F: `load_shares` weight a
-    `regularized`
-                                      system. They break loose together.
+                                      `regularized` system. They break loose together.
     sticking contacts, in space       least sum of squares: `pseudoinverse`, taken once
-    a step,
-                                      when the normal forces of its stages are not known
-                                      yet
+                                      a step, when the normal forces of its stages are
+                                      not known yet
     normal forces and impulses        least sum of squares, in the scaling with unit
-    diagonal
+                                      diagonal
 """
 
 import functools

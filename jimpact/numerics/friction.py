@@ -4,8 +4,9 @@ one row.
 With A = D^T M^-1 D of the normals and tangents D = [N, H] and x = (p, p_t) the question
 is
 
-    normal      r = a + A_n x:  r = 0 (prescribed), or  0 <= r _|_ p >= 0
-    (complementary) tangential  s = b + A_t x,  p_t in -mu max(p, 0) Sgn(s)
+    normal      r = a + A_n x:  r = 0 (prescribed), or
+                0 <= r _|_ p >= 0 (complementary)
+    tangential  s = b + A_t x,  p_t in -mu max(p, 0) Sgn(s)
 
 for impulses and velocities, or for forces and accelerations. Each contact is free (p =
 0, or it pulls; p_t = 0), sticks (s = 0) or slides (p_t = -mu p d, d = s / |s|). These

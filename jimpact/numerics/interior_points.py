@@ -4,15 +4,14 @@ With p = g a, p_t = h y, h / g = mu the disc |p_t| <= mu (p + load) is the cone 
 + load. With the rates scaled alike, nu = g r and s -> h s, contact with friction is
 
     a nu = 0                      a, nu >= 0                           (complementary)
-    Y o K = (Y . K, Y_0 K_t + K_0 Y_t) = 0,   Y = (a + load, y) and K = (kappa, s) in
-    the cone
+    Y o K = (Y . K, Y_0 K_t + K_0 Y_t) = 0,
+    Y = (a + load, y) and K = (kappa, s) in the cone
 
 where kappa = |s|. For `nu = g r + |s| - kappa` with a known |s| this would be a convex
 problem, which Mehrotra's predictor and corrector solve in a few iterations, however
 redundant the contacts and wherever slip turns to. |s| is that of the iteration before
 as long as contacts might still stick, and changes with s where they slide. Where r = 0
-is prescribed, a contact that pulls has
-p = g (a - nu), a nu = 0. Interior points converge slowly where p = r = 0, so Newton's
+is prescribed, a contact that pulls has p = g (a - nu), a nu = 0. Interior points converge slowly where p = r = 0, so Newton's
 method on the modes ends it.
 
 Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the convex

@@ -2,11 +2,11 @@
 unloading cuts.
 
 A step looks for impulses q = (f, y), normal (m) and tangential (t), at which the
-velocities
-`w = b + K q` after it satisfy
+velocities `w = b + K q` after it satisfy
 
     friction    y_j in the disc of radius mu_j f_j, against u_j: at its rim where u_j is
-    not 0 normal      f_j = F_j - a_j max(gamma_j, 0), not below 0
+                not 0
+    normal      f_j = F_j - a_j max(gamma_j, 0), not below 0
 
 with the force F_j that the indentation at the beginning of the step gives, and the part
 a_j gamma_j of it that a fast unloading takes away within the step (0: none). With F_j

@@ -25,8 +25,7 @@ def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
 
     Returns:
         Row j, column i: Gamma_ji; NaN or inf in columns with E_i = 0 (0/0 at the first
-            touch:
-        why the law is integrated in time form, see `LZB`).
+        touch: why the law is integrated in time form, see `LZB`).
 
     Raises:
         ValueError: energy < 0, stiffness <= 0, exponent < 1.
