@@ -89,16 +89,16 @@ def simulate(
         step: of method 'time_stepping' [s].
         max_events: largest number of recorded events; the next one ends the motion with
             status `max_events` (time stepping goes on without recording). None: 500;
-            for a direct call with method 'events' (outside jit, vmap, derivatives) 100
-            000, computed in runs of 500.
+            for a direct call with method 'events' (outside jit, vmap, derivatives)
+            100 000, computed in runs of 500.
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its
         status. Methods 'events' and 'contact_forces' have derivatives in both modes
-        (grad, jvp, hessian) of everything in it, event times and accumulated works included, in all
-        arrays, also those captured by the system's functions. They hold for the order
-        of events that occurs: one-sided where two events change places or a contact is
-        grazed; NaN of what a motion does not reach.
+        (grad, jvp, hessian) of everything in it, event times and accumulated works
+        included, in all arrays, also those captured by the system's functions. They
+        hold for the order of events that occurs: one-sided where two events change
+        places or a contact is grazed; NaN of what a motion does not reach.
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with

@@ -11,8 +11,8 @@ where kappa = |s|. For `nu = g r + |s| - kappa` with a known |s| this would be a
 problem, which Mehrotra's predictor and corrector solve in a few iterations, however
 redundant the contacts and wherever slip turns to. |s| is that of the iteration before
 as long as contacts might still stick, and changes with s where they slide. Where r = 0
-is prescribed, a contact that pulls has p = g (a - nu), a nu = 0. Interior points converge slowly where p = r = 0, so Newton's
-method on the modes ends it.
+is prescribed, a contact that pulls has p = g (a - nu), a nu = 0. Interior points
+converge slowly where p = r = 0, so Newton's method on the modes ends it.
 
 Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the convex
 problem.

@@ -66,9 +66,9 @@ WRONG = [
     ),
     (
         "events/run.py",
-        'rows: Float[Array, "3 m B"]',
-        'rows: Float[Array, "m B"]',
-        "Rest.rows",
+        'gamma: Float[Array, "m B"]',
+        'gamma: Float[Array, "3 m B"]',
+        "Rest.gamma",
     ),
     (
         "events/slip.py",
