@@ -47,8 +47,8 @@ CHUNK = 256
 # of a chunk. Ten times more: ten times the memory for what enters and leaves.
 QUEUE = 4096
 # Numbers in the arguments of a batch from which a queue pays for being compiled, a
-# third more than without: 6 000 impacts of three balls, 2 000 of six. Ten times more:
-# 4 096 impacts of six balls with random velocities take a third longer.
+# third more than without: 6 000 impacts of three balls, 2 000 of five at a wall. Ten
+# times more: 4 096 impacts of five at a wall, random velocities, take a third longer.
 QUEUE_FROM = 2**16
 # Both of impacts with tangents, which take more room in the cache and in memory.
 CHUNK_WITH_TANGENTS = 128
