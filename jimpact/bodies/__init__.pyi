@@ -22,6 +22,11 @@ from .closed_pairs import (
 from .functions import FunctionBody as FunctionBody
 from .particles import Column as Column, Corner as Corner
 from .pendulums import PendulumCradle as PendulumCradle
+from .rigid import (
+    place_of as place_of,
+    quaternion_of as quaternion_of,
+    turning_of as turning_of,
+)
 from .shapes import (
     Block as Block,
     Box as Box,

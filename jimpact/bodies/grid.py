@@ -296,8 +296,7 @@ def _closed(
     are missing.
 
     A contact is closed whose gap is at most `below` () [m] at q or `later`. Its number
-    is
-    `slots (i stride + partner) + slot`, partner j of body i, or b + corner of each
+    is `slots (i stride + partner) + slot`, partner j of body i, or b + corner of each
     plane in turn.
     """
     near = _near_gaps(bodies, q, later, below)

@@ -75,9 +75,8 @@ class MujocoScene(NamedTuple):
         friction: mu (m,), sliding friction of each contact; None where the scene has no
             tangents.
         names: the two geoms of each contact, as in "floor, box"; its normal points from
-            the
-            first one to the second one. Then "limit of joint knee" of each limit that
-            is reached.
+            the first one to the second one. Then "limit of joint knee" of each limit
+            that is reached.
 
     >>> import jimpact as ji
     >>> from jimpact.bodies.mujoco_scene import MujocoScene

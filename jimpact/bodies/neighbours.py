@@ -109,10 +109,9 @@ def crowd_of(least: float, largest: float, d: int) -> int:
     overlap.
 
     Equation: with radii from `least` to `largest` [m], s = 2 `least` and cells of
-    length
-    a = 2 `largest`, `N = D (3 a + s) (a + s)^(d - 1) / V + 1`, V the volume of a ball
-    of diameter s, D = .9069 (d = 2) and .7405 the share of the densest packing; one
-    more for bodies that overlap a little.
+    length a = 2 `largest`, `N = D (3 a + s) (a + s)^(d - 1) / V + 1`, V the volume of a
+    ball of diameter s, D = .9069 (d = 2) and .7405 the share of the densest packing;
+    one more for bodies that overlap a little.
     """
     ratio = largest / least
     density = {2: np.sqrt(4 / 3), 3: np.sqrt(2)}[d]  # D s^d / V

@@ -18,9 +18,8 @@ class PendulumCradle(Body):
     Equation: ball i at `(s_i + l sin(q_i), -l cos(q_i))`,
     `f_j = |c_{j+1} - c_j| - R_j - R_{j+1}`, `M = diag(m_i l^2)`: each ball hangs on two
     strings, so that it does not turn. The suspensions s_i stand so far apart that the
-    gaps at rest are `gaps`. At rest with closed gaps
-    `N = l N_chain`, so that W is that of `chain(masses)`, and gap velocities are `l`
-    times those.
+    gaps at rest are `gaps`. At rest with closed gaps `N = l N_chain`, so that W is that
+    of `chain(masses)`, and gap velocities are `l` times those.
 
     Args:
         masses: (n,) > 0 [kg], n >= 2.

@@ -97,9 +97,8 @@ class RigidBodies(Body):
     each.
 
     Equation: in the plane q holds (x, y, theta) of each body, x its centre of mass; in
-    space
-    (x, y, z, e_0, e_1, e_2, e_3), e a unit quaternion, scalar first, and velocities are
-    (x', omega), omega in the body's axes: `e' = e (0, omega) / 2`,
+    space (x, y, z, e_0, e_1, e_2, e_3), e a unit quaternion, scalar first, and
+    velocities are (x', omega), omega in the body's axes: `e' = e (0, omega) / 2`,
     `M v' = F - (0, omega x I omega)`; `moved` turns exactly and keeps the length of e.
     At a contact of bodies i and j in the point x, along a direction t,
     `v_t = t . (x_i' + omega_i x (x - x_i)) - t . (x_j' + omega_j x (x - x_j))`; in the

@@ -133,8 +133,7 @@ class Polygon(_PlanarBody):
 
     Args:
         corners: (k, 2) around the polygon, k >= 3, in a frame of its own [m]. Traced
-            ones must
-            be in counter-clockwise order.
+            ones must be in counter-clockwise order.
         mass: m > 0 [kg].
         inertia: I about the centre of mass [kg m^2]; None: homogeneous.
         centre: (2,) of mass, inside, in the frame of the corners [m]; None:

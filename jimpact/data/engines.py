@@ -105,8 +105,8 @@ def engine_impacts(
     Raises:
         ValueError: no such engine or scene.
 
-    Source: own measurements of the versions in the table; nearest
-    laws by `tests/validation/engines/nearest.py`.
+    Source: own measurements of the versions in the table; nearest laws by
+    `tests/validation/engines/nearest.py`.
 
     >>> import jimpact as ji
     >>> row = ji.data.engine_impacts("rapier2d", "S1").rows[0]

@@ -66,8 +66,8 @@ def square_impacts(near: float = 2e-3) -> Experiments:
 
     Velocities are those of the centre (m/s) and the angular velocity (rad/s), with
     standard errors before and after, each shot in the scene of its pose. A label is
-    "drop:frame", in frames of
-    4 ms. The mass is 1 kg: impacts with the table do not depend on it.
+    "drop:frame", in frames of 4 ms. The mass is 1 kg: impacts with the table do not
+    depend on it.
 
     Args:
         near: corners up to so far above the lowest one touch, too [m].
@@ -127,8 +127,7 @@ def cube_impacts(
         contacts: only impacts on this number of corners (or several numbers); None:
             all.
         near: corners up to so far above the lowest one touch, too (board and cube are
-            flat to
-            1.4 mm) [m].
+            flat to 1.4 mm) [m].
         nearly_clean: True: also 84 impacts on two corners that are less clean (flights
             before and after meet within .5 mm, not .3 mm). `docs/cube.md` compares laws
             on all of them.

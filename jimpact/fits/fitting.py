@@ -102,10 +102,9 @@ def fit(
             its own.
         starts: number of starts: the first from the law's values, then random ones, the
             last third around the best of these. None: the lowest of 128 to 1024 points,
-            of which only
-            values are computed, and further ones around the best as long as they lower
-            the sum of squares by more than the noise of a value. Starts that stay
-            behind others are given up.
+            of which only values are computed, and further ones around the best as long
+            as they lower the sum of squares by more than the noise of a value. Starts
+            that stay behind others are given up.
         profiles: whether intervals are those of `profile`; None: where standard errors
             cannot be trusted (at a bound, in a valley, with several minima, or for
             weakly determined parameters) and the law fits, of up to 3 parameters and

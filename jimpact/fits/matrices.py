@@ -29,6 +29,7 @@ from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix, scaled
 from jimpact.tools.compiling import full_precision, quick_jit
+from jimpact.tools.masks import quotient
 from jimpact.tools.status import CODE
 
 # A point drawn back stops short of the boundary by this share of the way, times eps.
@@ -211,9 +212,7 @@ class AdmissibleMatrices(eqx.Module):
         target = self.elementwise(y)
         # the others do not change along the ray
         crossed = (target < 0) & (target < slack)
-        share = jnp.where(
-            crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0
-        ).min()
+        share = quotient(slack, slack - target, where=crossed, otherwise=1.0).min()
 
         def shortened(state: _Share) -> _Share:
             """The share at which the approaches that are worst at the last one gain no
@@ -248,7 +247,7 @@ class AdmissibleMatrices(eqx.Module):
         # of a s^2 + 2 b s = c, in the form that does not cancel
         above = jnp.where(b > 0, c, root - b)
         below = jnp.where(b > 0, root + b, a)
-        return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
+        return quotient(above, below, where=below > 0, otherwise=jnp.inf)
 
     def conditions(
         self, y: Float[Array, " Q"]
@@ -287,7 +286,7 @@ def _quadratic(
     """
     length = jnp.sqrt(jnp.sum(rows**2, axis=1))
     depends = length > _FLAT * length.max()  # others are rounding
-    scale = jnp.where(depends, 1 / jnp.where(depends, length, 1.0), 0.0)
+    scale = quotient(1, length, where=depends)
     rows = rows * scale[:, None]
     slack = jnp.where(depends, slack * scale, 1.0)
     factor = jax.scipy.linalg.cho_factor(hessian)

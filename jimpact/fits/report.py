@@ -701,10 +701,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         residual: measured less predicted (K, n) [m/s]; NaN where no value was measured.
         rms: of the residual.
         noise: estimated standard error of one value; NaN where no degree of freedom is
-            left, 1
-            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor
-            that
-            the standard errors are multiplied by.
+            left, 1 if `sigma` is known, or, if chi^2 shows that sigma is too small, the
+            factor that the standard errors are multiplied by.
         degrees_of_freedom: independent measured values less `rank`.
         rank: of the Jacobian; below P: see `identifiability`.
         singular_values: (P,) of the scaled Jacobian.
@@ -725,8 +723,7 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         warnings: the same in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN
-            where no
-            value was measured.
+            where no value was measured.
         loss: see `fit`.
         seed: of the random starts.
         profiles: of all parameters, where intervals are theirs, see `fit`; else none.

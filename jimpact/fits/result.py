@@ -411,9 +411,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
         Equation: `value -+ q standard_error`, q the quantile of Student's t with the
         degrees of freedom that are left, or of the normal law if `sigma` is known; of
-        what is fitted in
-        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum
-        of squares is higher by d, q^2 - d / noise^2 in place of q^2.
+        what is fitted in its logarithm `value exp(-+ q standard_error / value)`; at a
+        minimum whose sum of squares is higher by d, q^2 - d / noise^2 in place of q^2.
         """
         if self.profiles and self.profiles[0].level == level:
             return tuple(profile.intervals for profile in self.profiles)

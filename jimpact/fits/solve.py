@@ -1,10 +1,9 @@
 """Nonlinear least squares in a box, from many starts or of many problems at once.
 
-Minimize `|r(y)|^2 / 2` for `low <= y <= high`, by
-Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a
-variable on a bound whose gradient points outward is left out of the step, so minima on
-a bound are found exactly. One pass evaluates residual and Jacobian together, so that an
-impact is compiled once.
+Minimize `|r(y)|^2 / 2` for `low <= y <= high`, by Levenberg-Marquardt or by gradient
+descent with optax. Steps are cut at the box, and a variable on a bound whose gradient
+points outward is left out of the step, so minima on a bound are found exactly. One pass
+evaluates residual and Jacobian together, so that an impact is compiled once.
 
 Axes: S problems side by side, Q variables y, R residuals r.
 """
@@ -23,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.tools.checks import needed, suggestion
 from jimpact.tools.compiling import quick_jit
+from jimpact.tools.masks import choose
 from jimpact.tools.progress import Show
 from jimpact.tools.threads import in_parts
 
@@ -153,7 +153,7 @@ class LeastSquares:
 
 
 def _free_gradient(
-    problem: LeastSquares, y: Float[AnyArray, " Q"], gradient: Float[Array, " Q"]
+    problem: LeastSquares, y: Float[AnyArray, " Q"], gradient: Float[AnyArray, " Q"]
 ) -> Float[Array, " Q"]:
     """The projected gradient: 0 for a variable on a bound that a descent would cross.
 
@@ -334,7 +334,7 @@ def _pass(
     better = cost < state.cost
     tried = _Point(state.trial, residual, jacobian, aux, cost)
     before = _Point(state.y, state.residual, state.jacobian, state.aux, state.cost)
-    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, before)
+    best: _Point = choose(better, tried, before)
     y = best.y
     r = best.residual
     dtype = str(y.dtype)

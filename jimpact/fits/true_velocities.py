@@ -16,6 +16,7 @@ from jimpact.fits.errors_before import ErrorsBefore
 from jimpact.fits.measurement import Measurement
 from jimpact.fits.observables import Prediction, Shots
 from jimpact.tools.compiling import full_precision
+from jimpact.tools.masks import quotient
 
 # True velocities stay where a step moves none by more than this many of its standard
 # errors: the misfit, at its least there, is right to the square of it. Ten times more:
@@ -160,4 +161,4 @@ def _largest(
     stay.
     """
     uncertain = error > 0
-    return jnp.max(jnp.where(uncertain, change / jnp.where(uncertain, error, 1.0), 0.0))
+    return jnp.max(quotient(change, error, where=uncertain))

@@ -412,10 +412,9 @@ def _correlated(
 
     They grow in constant ratios, `pbar = s d`: d_i = 1 at the chosen contact i (True in
     (m,)), `d_j = r_j sqrt(W_jj / W_ii)`, r = `ratio` (m,), or its row i of (m, m), at
-    contacts beside it that it
-    presses and that do not separate, 0 elsewhere. With a = G d contact j is compressed
-    while `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
-    `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)` is that of kinetic energy:
+    contacts beside it that it presses and that do not separate, 0 elsewhere. With a = G
+    d contact j is compressed while `qn_j + a_j s < 0`, and returns e_j^2 of this work.
+    The loss `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)` is that of kinetic energy:
     `d.a s^2 / 2 + d.qn s + L = 0`, and s is the larger root. The status is `infeasible`
     where there is none, a contact would be compressed for ever (a_j <= 0), or one is
     left approaching. Then, or with none beside it, the chosen contact collides alone.

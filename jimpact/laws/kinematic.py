@@ -223,8 +223,8 @@ class RestitutionMatrix(Kinematic):
         tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is
             `v_t+ = -e_t v_t-`.
 
-    Open contacts take no part: their rows and columns of E count as zero; an
-    (m + k, m + k) matrix needs closed contacts (ValueError; `infeasible` if traced).
+    Open contacts take no part: their rows and columns of E count as zero; an (m + k, m
+    + k) matrix needs closed contacts (ValueError; `infeasible` if traced).
 
     Status: `negative_impulse`, `inadmissible_velocity`, `energy_gain` where E
     contradicts unilateral contact or energy at this velocity; `infeasible` where

@@ -163,10 +163,9 @@ def advise(
     contact re-closes as soon as its bodies approach, in `Compliant` only after the gap
     that opened has closed (as with a wall). Only `Compliant` follows open contacts that
     can close while others are loaded; this requires the absolute stiffness. Each law is
-    compared with it over the
-    unknown stiffness ratios: varied one at a time, at the corners of their ranges, and
-    at log-uniform samples. Open contacts of bodies that turn (of all scenes but chains)
-    take no part if they cannot close during the impact.
+    compared with it over the unknown stiffness ratios: varied one at a time, at the
+    corners of their ranges, and at log-uniform samples. Open contacts of bodies that
+    turn (of all scenes but chains) take no part if they cannot close during the impact.
 
     Args:
         scene: n coordinates, m contacts.
@@ -183,8 +182,7 @@ def advise(
             `friction`; None: contacts stick rigidly.
         stiffness_range: low and high factor on each unknown ratio k_j / k_first within
             a group of coupled contacts, or on each k_j if absolute stiffness matters;
-            default: (0.1, 10)
-            if `stiffness` is None, else (1, 1).
+            default: (0.1, 10) if `stiffness` is None, else (1, 1).
         samples: number of log-uniform samples.
         seed: of the samples.
         timing: measure the cost of every law (some seconds of compilation).

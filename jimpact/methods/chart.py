@@ -206,10 +206,9 @@ def work_precision(
     Errors are relative, the largest over a sample of impacts with the stiffness of
     every contact spread at random over a factor of 10, the impact itself among them:
     `max |dv| / max |v-|`, `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration, and the
-    Jacobian
-    `(d v+ / d ln k, d v+ / d e)`, with friction also `d v+ / d mu`, by forward mode,
-    its error over `max |v-|`. Times are per impact, one alone and in a batch, taken in
-    turns; compile times apart.
+    Jacobian `(d v+ / d ln k, d v+ / d e)`, with friction also `d v+ / d mu`, by forward
+    mode, its error over `max |v-|`. Times are per impact, one alone and in a batch,
+    taken in turns; compile times apart.
 
     Args:
         law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does.
@@ -225,8 +224,8 @@ def work_precision(
             this impact; None: Newton, Moreau, Poisson and Binary with the law's
             restitution and friction.
         reference: method that errors are measured from, at rtol 1e-14; None: the
-            event-aligned order 8. Its uncertainty is its distance from
-            a second solution: order 8 at 1e-12.
+            event-aligned order 8. Its uncertainty is its distance from a second
+            solution: order 8 at 1e-12.
         batch: impacts in a batch.
         repeats: of every time.
         gradients: measure those, too (with programs of their own).

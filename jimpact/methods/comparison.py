@@ -183,8 +183,7 @@ def compare(
         laws: by name; default: every law of the registry, with these
         values: parameters by name, `restitution=0.9, stiffness=..., exponent=...,
             matrix=...` (laws that need others are left out, see `left_out`);
-            restitution is 1 unless
-            it is among them.
+            restitution is 1 unless it is among them.
 
     Returns:
         `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison`

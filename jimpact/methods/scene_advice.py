@@ -340,8 +340,7 @@ def _effect_of_each_contact(
     Returns the indices of contacts with an impulse, and for all m contacts the error of
     v+ in the energy norm over that of v- and the largest change of a velocity [m/s,
     rad/s]. Both are 0 for a contact without impulse, and NaN beyond the first `runs`
-    contacts with the largest
-    `p_j sqrt(W_jj)`.
+    contacts with the largest `p_j sqrt(W_jj)`.
     """
     reference = trial.run([()])
     norm = trial.norm

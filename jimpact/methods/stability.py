@@ -255,11 +255,10 @@ def stability_map(
     (`chain_of`); and a setting of the method. A `scene` takes the place of the chains:
     its axes are `setting`, `stiffness_ratio` (two contacts and more), `exponent`,
     `restitution` and, with tangents, `friction`. Classes: `right` (error in v+ within
-    10 rtol; 1e-3 for fixed steps, of
-    the largest |v-|), `flagged` (a failure status, or refused beforehand), `wrong`
-    (silently), `gains energy`, `stalls` (silently wrong, and a ten times finer setting
-    does not halve the error), `does not end` (in `max_steps`), `not finite`,
-    `unchecked` (no reference ends).
+    10 rtol; 1e-3 for fixed steps, of the largest |v-|), `flagged` (a failure status, or
+    refused beforehand), `wrong` (silently), `gains energy`, `stalls` (silently wrong,
+    and a ten times finer setting does not halve the error), `does not end` (in
+    `max_steps`), `not finite`, `unchecked` (no reference ends).
 
     Args:
         methods: names in `jimpact.methods.contenders.CONTENDERS` that JAX can batch;
@@ -269,8 +268,7 @@ def stability_map(
             1e-8..1e8, `exponent` 1..5, `restitution` 0..1, `mass_ratio` 1e-6..1e6,
             `balls`, `friction` 0..10; None: all.
         base: point from which slices start, by name; default three equal Hertz balls, e
-            = 0.9
-            (of a scene: Hertz contacts of equal stiffness, e = 0.9, mu = 0.3).
+            = 0.9 (of a scene: Hertz contacts of equal stiffness, e = 0.9, mu = 0.3).
         resolution: values along a default axis.
         slices: 'one' axis at a time, or 'pairs' of axes as well.
         samples: number of Latin-hypercube points over all axes besides.

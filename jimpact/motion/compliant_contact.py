@@ -30,7 +30,6 @@ from jimpact.motion.flow import (
     allowed_errors,
     first_flight,
     one_pass,
-    selected,
     status_at_start,
     toward_sample,
 )
@@ -75,6 +74,7 @@ from jimpact.motion.transitions import (
 )
 from jimpact.numerics.driver import until_over
 from jimpact.tools.loops import any_lane
+from jimpact.tools.masks import choose
 from jimpact.tools.status import CODE
 
 # Of the cone: contacts that have reached its rim stick only if others take over more
@@ -310,7 +310,7 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         growth = length(by_contact((pushed.approach + pushed.delassus @ both)[m:], m))
         holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))
         sticks = jnp.all(~sticking.stick | holds)
-        chosen = selected(sticks, sticking, choice.modes)
+        chosen = choose(sticks, sticking, choice.modes)
         # a force that changes as fast as in a contact has slip begin at once
         if settings.spatial:
             chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
@@ -321,7 +321,7 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
     old = run.flight.aim.modes, jnp.asarray(True)
     happened = jnp.any(event)
     new = jax.lax.cond(any_lane(happened), decided, lambda: old)
-    modes, consistent = selected(happened, new, old)
+    modes, consistent = choose(happened, new, old)
     status = jnp.where(consistent, run.status, CODE["no_contact_force"]).astype(
         jnp.int32
     )
@@ -432,7 +432,7 @@ def _ended_slip(
     event = flown.event.at[2 * m :].set(ends)
     goes_on = flown._replace(event=event, stuck=jnp.asarray(False))
     again = toward_sample(goes_on, problem.times, flown.free)
-    return selected(here, again, flown), jnp.where(here, flown.state.t, run.vanished)
+    return choose(here, again, flown), jnp.where(here, flown.state.t, run.vanished)
 
 
 def _event(

@@ -40,6 +40,7 @@ from jimpact.motion.slip_in_space import slip_axes, straightened
 from jimpact.motion.tables import MotionProblem
 from jimpact.motion.transitions import velocity_noise
 from jimpact.numerics.stepper import any_of
+from jimpact.tools.masks import quotient
 
 # Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off
 # by a tenth of the tolerance.
@@ -445,6 +446,15 @@ def compliant_flow(
     )
 
 
+def stiffness_of(
+    force: Force, x: Float[Array, " m"], rate: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """dF/dx [N/m] of each contact at the indentation x >= 0 and its rate."""
+    one = jnp.ones_like(x)
+    _, stiffness = jax.jvp(lambda x: force.force(x, rate), (x,), (one,))
+    return stiffness
+
+
 def stable_step(
     force: Force, modes: Int[Array, "k 1"], contacts: Contacts, at: State
 ) -> Float[Array, ""]:
@@ -458,17 +468,15 @@ def stable_step(
     rate = -contacts.normal.rate
     m = len(at.contact[0])
     phase = modes[:m, 0]
-    one = jnp.ones_like(x)
     x = jnp.where(x >= 0, x, 0.0)
-    stiffness = jax.jvp(lambda x: force.force(x, rate), (x,), (one,))[1]
-    damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))[1]
+    stiffness = stiffness_of(force, x, rate)
+    one = jnp.ones_like(x)
+    _, damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))
     both = jnp.stack([unloading(force, phase, stiffness), damping], axis=1)
     both = jnp.where(loaded(phase)[:, None], both, 0.0)
     square, rate = jnp.max(jnp.abs(contacts.delassus[:m, :m]) @ jnp.abs(both), axis=0)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(square), rate))
-    return jnp.where(
-        fastest > 0, STABLE / jnp.where(fastest > 0, fastest, 1.0), jnp.inf
-    )
+    return quotient(STABLE, fastest, where=fastest > 0, otherwise=jnp.inf)
 
 
 def unloading(

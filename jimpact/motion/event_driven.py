@@ -24,7 +24,6 @@ from jimpact.motion.flow import (
     flow_of,
     one_pass,
     packed,
-    selected,
     status_at_start,
     toward_sample,
 )
@@ -42,6 +41,7 @@ from jimpact.motion.tables import (
 from jimpact.motion.transitions import resolve
 from jimpact.numerics.driver import until_over
 from jimpact.tools.loops import any_lane, over_lanes
+from jimpact.tools.masks import choose
 from jimpact.tools.status import CODE
 
 ROOM = 32  # numbers a contact that a run may hand over, in addition to states
@@ -163,7 +163,7 @@ def _unpack_checkpoint(start: _EventRun, past: Float[Array, " size"]) -> _EventR
     parts = jnp.split(past, ends)[1:-1]
     known = [x.reshape(like.shape).astype(like.dtype) for x, like in zip(parts, leaves)]
     on = past[0] > 0
-    own = selected(on, jax.tree.unflatten(tree, known), _checkpoint(start))._asdict()
+    own = choose(on, jax.tree.unflatten(tree, known), _checkpoint(start))._asdict()
     table = start.table._replace(samples=own.pop("samples"))
     status = jnp.where(on, CODE["ok"], start.status).astype(jnp.int32)
     return start._replace(**own, table=table, status=status)
@@ -269,8 +269,8 @@ def _resolved(
         )
         numbers = event_numbers(old, outcome.after)
         # an event without a row is not resolved
-        new = selected(full, run._replace(status=status), new)
-        return selected(waiting, new, run), numbers, marks
+        new = choose(full, run._replace(status=status), new)
+        return choose(waiting, new, run), numbers, marks
 
     def later(
         run: _EventRun,

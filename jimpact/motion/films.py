@@ -248,8 +248,8 @@ def positions(
     """q (K, n) at `time` (K,), by cubics between states q (S, n), dq/dt (S, n) at `at`
     (S,).
 
-    Equation: Hermite's `q = (1 + 2 s)(1 - s)^2 q_k + s^2 (3 - 2 s) q_(k+1)
-    + s (1 - s)^2 h q'_k - s^2 (1 - s) h q'_(k+1)`, `s = (t - t_k) / h`. Times may
+    Equation: Hermite's `q = (1 + 2 s)(1 - s)^2 q_k + s^2 (3 - 2 s) q_(k+1) + s (1 -
+    s)^2 h q'_k - s^2 (1 - s) h q'_(k+1)`, `s = (t - t_k) / h`. Times may
     repeat: states before and after an event.
 
     >>> import numpy as np

@@ -56,6 +56,7 @@ from jimpact.motion.slip_in_space import (
 from jimpact.motion.system import System
 from jimpact.numerics import stepper
 from jimpact.tools.loops import any_lane
+from jimpact.tools.masks import choose
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
@@ -389,8 +390,7 @@ class MechanicalFlow(MotionFlow):
 
         Equation: `q' = rates(q, v)`, `M v' = (loads) + N lambda_n + H lambda_t`, powers
         `F . v`, `lambda_t . u` and that of the base; then gap velocities of open
-        contacts, in space
-        `(ln |u|)'`.
+        contacts, in space `(ln |u|)'`.
         """
         at = unpacked(self.like, y)
         contacts = self.contacts(at)
@@ -452,7 +452,7 @@ class MechanicalFlow(MotionFlow):
         back = at._replace(
             q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1]
         )
-        return selected(jnp.any(jumps), at, back), jumps
+        return choose(jnp.any(jumps), at, back), jumps
 
 
 def packed(state: State) -> Float[Array, "rows 1"]:
@@ -557,11 +557,6 @@ def toward_sample(
     return flight._replace(aim=aim, plan=plan)
 
 
-def selected(which: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """The pytree `new` if `which`, else `old`, leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
-
-
 def one_pass(
     flow: MotionFlow,
     settings: Settings,
@@ -593,7 +588,7 @@ def one_pass(
     landed = flight.aim.target[:, 0] & accept  # margins that the step has brought to 0
     sampled = landed[-1]
     new, jumps = _reached(flow, flight.aim, after.y)
-    state = selected(accept, new, state)
+    state = choose(accept, new, state)
     jumps = jumps & accept
     event = landed[:-1].at[: len(jumps)].max(jumps)  # another normal is an event, too
     steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
@@ -628,7 +623,7 @@ def one_pass(
     # the stepper keeps its plan for a landing, a step in the root of time, and a
     # rejected one
     plain = sampled | (accept & in_time)
-    aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
+    aim, plan = choose(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
     return moved._replace(aim=aim, plan=plan), accept
 
 

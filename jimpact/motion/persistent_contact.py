@@ -33,6 +33,7 @@ from jimpact.numerics.dense import (
 )
 from jimpact.numerics.friction import solve
 from jimpact.numerics.lcp import solve_lcp
+from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
@@ -129,7 +130,7 @@ def direction(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
     if rows.shape[1] == 1:
         return jnp.sign(rows)
     size = length(rows)[:, None]
-    return jnp.where(size > 0, rows / jnp.where(size > 0, size, 1.0), 0.0)
+    return quotient(rows, size, where=size > 0)
 
 
 def in_space(contacts: Contacts) -> bool:

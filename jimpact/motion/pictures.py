@@ -441,8 +441,7 @@ def phase_portrait(
     Args:
         motion: one motion.
         coordinate: which, counted from 0; None: the one with the largest range times
-            range of
-            its velocity, in SI units.
+            range of its velocity, in SI units.
         title: of the picture.
         names: of the coordinates, as in `motion`.
         system: that moved, as in `motion`; needed where velocities are not the rates of

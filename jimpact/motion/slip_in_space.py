@@ -42,6 +42,7 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.numerics.dense import solve_by_pivots
 from jimpact.tools.loops import any_lane
+from jimpact.tools.masks import quotient
 
 # Least part of the slip at the beginning of a step that lies ahead within it. Ten times
 # more, and what a landing leaves of slip that turns is ten times as large.
@@ -164,9 +165,7 @@ def log_rates(
     u = by_contact(contacts.tangent.rate, m)
     square = jnp.maximum(jnp.sum(u * u, axis=1), axes.least**2)
     slides = modes.active & ~modes.stick & (modes.sign != BEGINS) & ~axes.last
-    return jnp.where(
-        slides, jnp.sum(u * growth, axis=1) / jnp.where(slides, square, 1.0), 0.0
-    )
+    return quotient(jnp.sum(u * growth, axis=1), square, where=slides)
 
 
 def turning_errors(

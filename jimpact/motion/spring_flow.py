@@ -40,6 +40,7 @@ from jimpact.motion.compliant_flow import (
     contact_scales,
     loaded,
     normal_forces,
+    stiffness_of,
     unloading,
 )
 from jimpact.motion.flow import State, longest_step, packed, roundings, unpacked
@@ -54,6 +55,7 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.tables import MotionProblem
 from jimpact.motion.transitions import velocity_noise
+from jimpact.tools.masks import quotient
 
 # Rate |u| / r above which a contact drags, in the frequency of the stiffest contact.
 # Directions err by its inverse cubed; ten times more: slow slip takes ten times as many
@@ -138,13 +140,11 @@ class SpringMotionFlow(CompliantFlow):
         """
         x = at.contact[0]
         deep = x > 0
-        secant = jnp.where(deep, push / jnp.where(deep, x, 1.0), 0.0)
+        secant = quotient(push, x, where=deep)
         xi = springs(at)
         stretched = self.steep * length(xi)
         beyond = stretched > self.coulomb * x  # by rounding, or BEYOND
-        share = jnp.where(
-            beyond, self.coulomb * x / jnp.where(beyond, stretched, 1.0), 1.0
-        )
+        share = quotient(self.coulomb * x, stretched, where=beyond, otherwise=1.0)
         held = -(self.steep * secant * share)[:, None] * xi
         sliding = -(self.coulomb * push)[:, None] * n
         side = jnp.where((const.slide == Slide.HOLDS)[:, None], held, sliding)
@@ -180,7 +180,7 @@ class SpringMotionFlow(CompliantFlow):
         turning = self.coulomb * at.contact[0] * jnp.sum(across * growth, axis=1)
         divisor = length(u) * pace
         behind = drags & (divisor > 0)
-        lag = jnp.where(behind, turning / jnp.where(behind, divisor, 1.0), 0.0)
+        lag = quotient(turning, divisor, where=behind)
         return jnp.cos(lag)[:, None] * first - jnp.sin(lag)[:, None] * across
 
     def spring_rates(  # type: ignore[override]
@@ -279,8 +279,8 @@ class SpringMotionFlow(CompliantFlow):
         m = len(const.slide)
         _, _, fired, *dragging = which[:-1, 0].reshape(-1, m)  # the last: a sample
         toggled = jnp.zeros_like(fired)
-        for ended in dragging:  # in space
-            toggled = ended & ~fired
+        if dragging:  # in space
+            toggled = dragging[0] & ~fired
         contacts, force = self.contact_forces(const, at)
         n = self.directions(const, at, contacts, force.normal)
         assert contacts.tangent is not None
@@ -477,8 +477,7 @@ def _frequency(
     Equation: `omega^2 = max_i sum_j |W_ij| k_j`, k_j = dF/dx in normal rows and
     kappa dF/dx in tangential ones.
     """
-    one = jnp.ones_like(x)
-    normal = jax.jvp(lambda x: force.force(x, 0 * x), (x,), (one,))[1]
+    normal = stiffness_of(force, x, jnp.zeros_like(x))
     return _fastest(contacts, normal, kappa * normal)
 
 
@@ -505,19 +504,18 @@ def stable(
     const = flow.constants(modes)
     m = len(const.slide)
     x = jnp.maximum(at.contact[0], 0.0)
-    one = jnp.ones_like(x)
-    stiffness = jax.jvp(lambda x: flow.force.force(x, 0 * x), (x,), (one,))[1]
+    stiffness = stiffness_of(flow.force, x, jnp.zeros_like(x))
     acts = loaded(const.phase)
     holds = acts & (const.slide == Slide.HOLDS)
     normal = jnp.where(acts, unloading(flow.force, const.phase, stiffness), 0.0)
     side = jnp.where(holds, flow.tangential_stiffness * stiffness, 0.0)
     fastest = _fastest(contacts, normal, side)
     some = fastest > 0
-    by_springs = jnp.where(some, STABLE / jnp.where(some, fastest, 1.0), jnp.inf)
+    by_springs = quotient(STABLE, fastest, where=some, otherwise=jnp.inf)
     slip = length(by_contact(contacts.tangent.rate, m))
     turns = acts & (const.slide == Slide.SLIDES) & (slip > 0)
     if len(at.spring) == 1:
         turns = jnp.zeros_like(turns)
     r = flow.limit(x)
-    by_turning = jnp.where(turns, TURN * r / jnp.where(turns, slip, 1.0), jnp.inf)
+    by_turning = quotient(TURN * r, slip, where=turns, otherwise=jnp.inf)
     return jax.lax.stop_gradient(jnp.minimum(by_springs, jnp.min(by_turning)))

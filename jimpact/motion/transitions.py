@@ -23,7 +23,7 @@ from jimpact.motion.dynamics import (
     not_rounding,
     seen_from_base,
 )
-from jimpact.motion.flow import Scales, Settings, State, selected, speed_of
+from jimpact.motion.flow import Scales, Settings, State, speed_of
 from jimpact.motion.persistent_contact import (
     Contacts,
     ModeChoice,
@@ -40,6 +40,7 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.record import KIND_CODE
 from jimpact.motion.system import System
+from jimpact.tools.masks import choose, quotient
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE, STATUS
 
@@ -404,7 +405,7 @@ def _brought_slow_to_rest(
     both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
     alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     undisturbed = _undisturbed(system, contacts, cluster, strike.t)
-    return selected(undisturbed, cluster, alone)
+    return choose(undisturbed, cluster, alone)
 
 
 def _slack(strike: _Strike) -> Float[Array, ""]:
@@ -529,9 +530,7 @@ def _undisturbed(
     root = jnp.sqrt(jnp.maximum(square, 0.0))
     # time of the zero: with f' < 0 in a form without cancellation
     later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
-    reached = jnp.where(
-        rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later
-    )
+    reached = quotient(2 * gap, root - rate, where=rate < 0, otherwise=later)
     never = (square < 0) | ((rate >= 0) & (fall >= 0))
     return jnp.all(result.at_rest | never | (reached > result.passed.time))
 

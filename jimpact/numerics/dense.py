@@ -51,6 +51,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import cond, fori_loop, while_loop
+from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
 
 # Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is
@@ -600,9 +601,7 @@ def _orthogonal(
         ]
         half = (squares[1] - squares[0]) / 2
         real = jnp.minimum(*squares) > (rounding**2) * whole  # other columns are 0
-        angle = jnp.where(
-            real, product**2 / jnp.where(real, squares[0] * squares[1], 1.0), 0.0
-        )
+        angle = quotient(product**2, squares[0] * squares[1], where=real)
         root = jnp.sqrt(half**2 + product**2)
         longer = jnp.where(half >= 0, half + root, half - root)
         slope = product / jnp.where(longer != 0, longer, 1.0)

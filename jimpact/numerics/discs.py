@@ -5,6 +5,8 @@ friction.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jimpact.tools.masks import quotient
+
 
 def normals_of(x: Float[Array, "m b *N"]) -> Float[Array, "m 1 *N"]:
     """The normal rows of impulses or rates x, first of the b rows of each contact."""
@@ -27,7 +29,7 @@ def over(
 ) -> Float[Array, "m rows N"]:
     """Vectors over lengths, v / length; 0 where the length is 0."""
     positive = length > 0
-    inverse = jnp.where(positive, 1 / jnp.where(positive, length, 1.0), 0.0)
+    inverse = quotient(1, length, where=positive)
     return inverse[:, None] * vectors
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from jimpact.tools.loops import while_loop
+from jimpact.tools.masks import choose
 
 # Impacts that a CPU computes side by side: 128 and 512 take a tenth longer. Ten times
 # more: stages leave a core's cache; ten times fewer: each operation has too few numbers
@@ -113,7 +114,7 @@ def _in_slots(
         enters = free & (next_one < count)
         impact = jnp.where(enters, next_one, s.impact)
         new_flow, new = picked((flow, carry), impact)
-        new = jax.tree.map(lambda a, b: jnp.where(enters, a, b), new, s.carry)
+        new = choose(enters, new, s.carry)
         following = s.following + jnp.sum(enters, dtype=jnp.int32)
         return _Slots(impact, following, new_flow, new, stored(s))
 

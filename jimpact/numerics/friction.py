@@ -49,6 +49,7 @@ from jimpact.numerics.lcp import gathered_rounding
 from jimpact.numerics.many_contacts import solve_many
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import fori_loop, while_loop
+from jimpact.tools.masks import choose
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
@@ -726,7 +727,7 @@ def _search(problem: _FrictionProblem) -> _Decision:
         begin = _Polish(tried.impulse, tried, jnp.asarray(0))
         tried = while_loop(goes_on, newton, begin).best
         less = tried.misfit < best.misfit
-        best = jax.tree.map(lambda a, b: jnp.where(less, a, b), tried, best)
+        best = choose(less, tried, best)
         return best, number + 1
 
     def attempts_left(state: tuple[Best, Int[Array, ""]]) -> Bool[Array, ""]:

@@ -30,6 +30,7 @@ from jimpact.numerics.dense import block_solve
 from jimpact.numerics.discs import tangents_of
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import fori_loop, while_loop
+from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
 
 # Iterations of an attempt; 10 to 15 are usual. Ten times more: what diverges takes
@@ -289,7 +290,7 @@ def _room_of_normals(at: _Inside, way: _Inside) -> Float[Array, ""]:
     """Largest multiple of the change `way` with which all a and nu stay >= 0."""
     value = jnp.concatenate([at.push, at.normal])
     falls = jnp.concatenate([way.push, way.normal]) / value
-    return jnp.min(jnp.where(falls < 0, -1 / jnp.where(falls < 0, falls, 1.0), jnp.inf))
+    return jnp.min(quotient(-1, falls, where=falls < 0, otherwise=jnp.inf))
 
 
 def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> Float[Array, ""]:
@@ -307,4 +308,4 @@ def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> Float[Array, ""]:
     along = first * grows - jnp.sum(side * change, axis=1)
     across = change - ((along + grows) / (1 + first))[:, None] * side
     out = jnp.max((jnp.sqrt(jnp.sum(across**2, axis=1)) - along) / root)
-    return jnp.where(out > 0, 1 / jnp.where(out > 0, out, 1.0), jnp.inf)
+    return quotient(1, out, where=out > 0, otherwise=jnp.inf)

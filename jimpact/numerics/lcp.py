@@ -19,6 +19,7 @@ from jimpact.numerics.sparse import Sparse, conjugate_gradients
 from jimpact.numerics.tridiagonal import Symmetric, as_matrix, is_regular
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
+from jimpact.tools.masks import choose, quotient
 from jimpact.tools.precision import precision
 from jimpact.tools.status import CODE
 
@@ -259,8 +260,7 @@ def _support(
         """
         row, ray = _leaving(state, tolerance)
         moved = _pivot(state, row)
-        chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
-        return chosen._replace(ray=ray)
+        return choose(ray, state, moved)._replace(ray=ray)
 
     end = while_loop(going, one, first)
     number = jnp.arange(m)
@@ -285,9 +285,7 @@ def _leaving(
         state.rows.dtype
     )
     candidates = column > tolerance
-    ratio = jnp.where(
-        candidates, state.rows[:, -1] / jnp.where(candidates, column, 1.0), jnp.inf
-    )
+    ratio = quotient(state.rows[:, -1], column, where=candidates, otherwise=jnp.inf)
     return jnp.argmin(ratio), ~jnp.any(candidates)
 
 

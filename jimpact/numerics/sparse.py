@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
+from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
 
 # Residual over the right side at which conjugate gradients end, in roundings, and the
@@ -204,11 +205,11 @@ def conjugate_step(
     image = product(direction)
     curvature = dot(direction, image)
     curved = curvature > 0
-    length = jnp.where(curved, square / jnp.where(curved, curvature, 1.0), 0.0)
+    length = quotient(square, curvature, where=curved)
     x = x + length * direction
     residual = residual - length * image
     new = dot(residual, residual)
-    ratio = jnp.where(square > 0, new / jnp.where(square > 0, square, 1.0), 0.0)
+    ratio = quotient(new, square, where=square > 0)
     return Iterate(x, residual, residual + ratio * direction, new), curved
 
 

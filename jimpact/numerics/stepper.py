@@ -15,9 +15,8 @@ ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 A landing on margin k runs from xi = c_k (or its root) to exactly 0 (M. Henon, On the
 numerical computation of Poincare maps, Physica D 5, 1982): no root is searched for, and
 the length of the step has derivatives. An event where a step begins is a landing of
-length 0; an
-explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so
-there are no jump rules, also where events coincide.
+length 0; an explicit Runge-Kutta step of length 0 has the right derivatives up to its
+order, so there are no jump rules, also where events coincide.
 
 WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a distance in
 units of the step just tried; the most urgent one decides (`advance`).

@@ -1,9 +1,9 @@
 """Runge-Kutta tableaux: a method is data.
 
 `DOP853` is Dormand and Prince's 8(5,3) pair: 12 stages, order 8, with a fifth- and a
-third-order error estimate. Source: Hairer, Norsett and Wanner, Solving
-Ordinary Differential Equations I (2nd ed., 1993), II.5, II.10 and the coefficients of
-their code DOP853.
+third-order error estimate. Source: Hairer, Norsett and Wanner, Solving Ordinary
+Differential Equations I (2nd ed., 1993), II.5, II.10 and the coefficients of their code
+DOP853.
 """
 
 from typing import NamedTuple

@@ -231,10 +231,9 @@ class Experiments(eqx.Module):
         s].
 
         Equation: `C^T M (v+ - v-)`, columns of C spanning the complement of range(N),
-        each
-        scaled to a largest entry of 1. A chain without walls has c = 1, C = (1, ...,
-        1): its total momentum. NaN for shots with missing values. `scene`: where shots
-        carry none.
+        each scaled to a largest entry of 1. A chain without walls has c = 1, C = (1,
+        ..., 1): its total momentum. NaN for shots with missing values. `scene`: where
+        shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -272,12 +271,11 @@ class Experiments(eqx.Module):
         """The same shots, moved as little as possible so that they conserve momentum.
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to
-        `C^T M (v+' - v-) = 0`
-        (sigma = 1 where unknown; with a `covariance` by that of v+). For equal masses
-        in a chain: the mean excess is taken from each component. Shots with missing
-        values stay as they are. v- stay as they were measured; where they have a
-        `sigma_pre`, `fit` passes it on through the correction. `scene`: where shots
-        carry none.
+        `C^T M (v+' - v-) = 0` (sigma = 1 where unknown; with a `covariance` by that of
+        v+). For equal masses in a chain: the mean excess is taken from each component.
+        Shots with missing values stay as they are. v- stay as they were measured; where
+        they have a `sigma_pre`, `fit` passes it on through the correction. `scene`:
+        where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])

@@ -157,8 +157,7 @@ class AdmissibleSet:
         included.
 
         On a straight side one gap velocity gamma+ or one impulse is 0; `points` lie on
-        the arc
-        T+ = T-.
+        the arc T+ = T-.
 
         Raises:
             ValueError: the set is not two-dimensional.
@@ -231,8 +230,8 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
 
     Equation: `v+ = v- + M^-1 N p` with `p >= 0`, `gamma+ >= 0` at closed contacts (p =
     0 at open ones) and `T+ <= T-`. In kinetic coordinates the set is the part of a ball
-    between flat
-    walls; for two contacts, the region under an arc A-B of the circle of equal energy.
+    between flat walls; for two contacts, the region under an arc A-B of the circle of
+    equal energy.
 
     Args:
         scene: n coordinates, m contacts, redundant ones included.

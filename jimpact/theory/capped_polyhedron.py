@@ -42,8 +42,7 @@ class CappedPolyhedron(NamedTuple):
 
         Least distance programming (Lawson and Hanson 1974, ch. 23): rows with a
         positive multiplier x hold with equality, x the nonnegative least squares
-        solution of
-        `[rows, need]^T x = (0, ..., 0, 1)`, `need = offset - rows point`.
+        solution of `[rows, need]^T x = (0, ..., 0, 1)`, `need = offset - rows point`.
         """
         need = self.offset - self.rows @ point
         if not (need > 0).any():

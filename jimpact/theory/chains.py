@@ -30,9 +30,8 @@ def bilateral_motion(
     """Displacements and velocities where contacts are springs that also pull.
 
     Equation: `M x'' = -N K N^T x`, `x(0) = 0`, `x'(0) = v-`. It is the motion of
-    `Compliant`
-    with `LinearSpring` at touching contacts until the first of them opens, which is
-    when an entry of `N^T x` returns to 0.
+    `Compliant` with `LinearSpring` at touching contacts until the first of them opens,
+    which is when an entry of `N^T x` returns to 0.
 
     Args:
         scene: n coordinates, m contacts; its gaps play no part.

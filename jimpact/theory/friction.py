@@ -230,13 +230,11 @@ def friction_bounds(
 
     Equation: `G^mu = G - n_q^T H_t [mubar][xi]`, `mubar_i = mu_i / |grad f_i|`, and the
     bounds `|G^-1| |n_q^T H_t| |mubar| < 1`, `|E|^2 cond(G) < 1`,
-    `lambda_min(Mbar) > lambda_max(K)`,
-    `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar| |(G^mu)^-1| |I + E| / (lambda_min -
-    lambda_max)`, where `Mbar = (I - E)^T G^-1 (I + E)` and `K = B^T B`, `B = t_q^T H_t
-    [mubar][xi] (G^mu)^-1
-    (I + E)`. Spectral norms; eigenvalues of symmetric parts; [x] is the diagonal matrix
-    of x, G the normalized Delassus matrix, n_q and t_q the basis of `quasi_basis`,
-    `pbar = |grad f| p`.
+    `lambda_min(Mbar) > lambda_max(K)`, `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar|
+    |(G^mu)^-1| |I + E| / (lambda_min - lambda_max)`, where `Mbar = (I - E)^T G^-1 (I +
+    E)` and `K = B^T B`, `B = t_q^T H_t [mubar][xi] (G^mu)^-1 (I + E)`. Spectral norms;
+    eigenvalues of symmetric parts; [x] is the diagonal matrix of x, G the normalized
+    Delassus matrix, n_q and t_q the basis of `quasi_basis`, `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents H_t (n, m).
@@ -253,9 +251,8 @@ def friction_bounds(
             redundant ones; friction so large that G^mu is singular.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.6 and Theorem 6.2, corrected:
-    with
-    G^-1 in (6.58) the matrix M of (6.59) is G^-1 itself, which empties Prop. 6.6 (2),
-    turns (3) into that of Prop. 6.5, and (6.61)(ii) lacks the factor |(G^mu)^-1|.
+    with G^-1 in (6.58) the matrix M of (6.59) is G^-1 itself, which empties Prop. 6.6
+    (2), turns (3) into that of Prop. 6.5, and (6.61)(ii) lacks the factor |(G^mu)^-1|.
 
     >>> import jimpact as ji
     >>> particle = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])

@@ -275,8 +275,7 @@ def _impact(
     itself.
 
     Equation: `gamma+ = -e gamma-`; with friction `u+ = 0` where `slides` (s,) is 0,
-    else
-    `p_t = -mu p slides`. It contradicts itself unless p > 0, |p_t| <= mu p where a
+    else `p_t = -mu p slides`. It contradicts itself unless p > 0, |p_t| <= mu p where a
     contact sticks, and u+ has the sign `slides`.
     """
     m = problem.contacts

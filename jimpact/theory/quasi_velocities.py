@@ -144,10 +144,10 @@ def contact_power(
     Equation: with `F_norm^n = G lambda_bar`, `F_norm^t = n_q^T H lambda_t` and
     `F_tan^t = t_q^T H lambda_t`: `normal = <F_norm^n, qn>_Dn = gamma^T lambda`
     (6.36)-(6.37), `coupling = <qn, F_norm^t>_Dn`, `tangential = <qt, F_tan^t>_Dt`
-    (6.39), where
-    `<a, b>_D = a^T D b`, `D_n = G^-1`, `D_t = I`, `lambda_bar = |grad f| lambda`; G,
-    n_q, t_q as in `from_quasi_velocities`, H the tangents. Coupling and tangential
-    together are the local power `v_t^T lambda_t` of (6.41).
+    (6.39), where `<a, b>_D = a^T D b`, `D_n = G^-1`, `D_t = I`,
+    `lambda_bar = |grad f| lambda`; G, n_q, t_q as in `from_quasi_velocities`, H the
+    tangents. Coupling and tangential together are the local power `v_t^T lambda_t` of
+    (6.41).
 
     Args:
         scene: n coordinates, m contacts; with tangents where tangential forces act.

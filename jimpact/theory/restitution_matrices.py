@@ -51,10 +51,9 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     Let a minimizer have the smallest possible support S. It is a local minimum of the
     Rayleigh quotient of Q_SS, hence an eigenvector of the *smallest* eigenvalue, as the
     quotient has no other local minima. That eigenvalue is simple: else one could move
-    inside its eigenspace
-    until a component vanishes, and S would not be smallest. So the lowest eigenvector
-    of every Q_SS holds the minimizer; clipped to `x >= 0` every one is feasible and
-    none is rejected.
+    inside its eigenspace until a component vanishes, and S would not be smallest. So
+    the lowest eigenvector of every Q_SS holds the minimizer; clipped to `x >= 0` every
+    one is feasible and none is rejected.
 
     Args:
         matrix: Q (m, m), m <= 12; only its symmetric part counts.
@@ -353,9 +352,8 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
 
     For e = 0 (persistent contact) the loss is the energy of the lost velocities,
     whatever the contacts, redundant ones included. For one e at all contacts it holds
-    for Newton's E = e I
-    and for Moreau's law, as both have `qn+^T pbar = -e qn-^T pbar`; else it does not
-    apply.
+    for Newton's E = e I and for Moreau's law, as both have
+    `qn+^T pbar = -e qn-^T pbar`; else it does not apply.
 
     Args:
         scene: the scene of the impact.

@@ -12,8 +12,7 @@ def bounce_times(times: Any, sigma: Any, gravity: float = 9.80665) -> Experiment
     """Shots of a ball that bounces on a plane, from the times at which it does.
 
     Equation: a flight of duration T between bounces leaves with `g T / 2` and arrives
-    with
-    `-g T / 2`: at the inner bounces `v- = -g (t_k - t_(k-1)) / 2`,
+    with `-g T / 2`: at the inner bounces `v- = -g (t_k - t_(k-1)) / 2`,
     `v+ = g (t_(k+1) - t_k) / 2`. No drag; the plane is as high at each bounce.
     Successive bounces share a flight: the covariance is of all shots, and v+ of one is
     exactly -v- of the next.

@@ -24,6 +24,7 @@ RATE_WITHIN = 5e-4
 DIGIT_WITHIN = 1e-3
 # frames of exactly 0, 0, 0 in a row from which on a marker was lost there
 AT_AN_END = 2
+HEAD = 2  # columns before those of markers: number of the frame, and time
 LENGTHS = {
     "meters": "m",
     "metres": "m",
@@ -235,8 +236,8 @@ def _stated(path: Path, key: str, cell: str) -> float | None:
 
 
 def _without_head(values: np.ndarray) -> np.ndarray:
-    """The columns of markers: those behind the number of the frame and its time."""
-    return values[:, 2:]
+    """The columns of markers."""
+    return values[:, HEAD:]
 
 
 def _rounding_of_times(body: list[tuple[int, list[str]]]) -> float:
@@ -257,11 +258,10 @@ def _trc(path: Path, text: str) -> Capture:
     cells = [[x.strip() for x in line.split("\t")] for line in lines]
     _, keys, words, of_markers, _, *rows = cells
     head = dict(zip(keys, words))
-    _, _, *names = of_markers  # beside Frame# and Time
-    names = [x for x in names if x]
+    names = [x for x in of_markers[HEAD:] if x]
     _check_once(path, names)
     body = [(k, row) for k, row in enumerate(rows, 6) if any(row)]
-    values = _rows(path, body, 2 + 3 * len(names))
+    values = _rows(path, body, HEAD + 3 * len(names))
     frames, times, *_ = values.T
     found = _in_threes(names, _without_head(values))
     unit = _unit(path, "Units", head.get("Units", ""))
@@ -365,9 +365,9 @@ def _heads_of_optitrack(
         row = [x.strip().strip('"') for x in cells]
         if row[0] == "Frame":
             kinds = [x for x in found if {"Position", "Rotation"} & set(x)]
-            names = [x for x in found if "Name" in x]
-            if not names:  # without words in front, names are in the second row
-                _, *names = found
+            # without words in front, names are in the second row
+            labelled = [x for x in found if x[1] == "Name"]
+            names = labelled or found[1:]
             if kinds and names:
                 return k, names[0], kinds[-1], row
         if any(row) and len(row) > 1:
@@ -398,7 +398,7 @@ def _vicon(path: Path, text: str) -> Capture:
         if not any(cells):
             break
         body.append((k, cells))
-    values = _rows(path, body, 2 + 3 * len(names))
+    values = _rows(path, body, HEAD + 3 * len(names))
     found = _in_threes(names, _without_head(values))
     frames = values[:, 0]
     if rate is None:

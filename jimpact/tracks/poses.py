@@ -12,12 +12,13 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from jimpact.bodies.rigid import place_of, turning_of
 from jimpact.shots.covariances import diagonal_blocks
 from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.frames import noise
 from jimpact.tracks.judging import findings_of_noise, findings_of_turns
-from jimpact.tracks.quaternions import places_and_turns, turns_since_first
+from jimpact.tracks.quaternions import turns_since_first
 from jimpact.tracks.track import Track, TrackImpact
 from jimpact.tracks.turning import Turning, fit_turning
 
@@ -89,9 +90,8 @@ def _met(
     between the flights of each impact, the least `(x - x_0)^T C^-1 (x - x_0)` with g =
     0:
     `x - x_0 = C H^T S^-1 (H (x - x_0) - g)`, H = dg/dx, `S = H C H^T`, repeated;
-    covariance
-    `C - C H^T S^-1 H C`. The p-value of an impact is that of chi^2 = g S^-1 g of its
-    turn at x_0.
+    covariance `C - C H^T S^-1 H C`. The p-value of an impact is that of chi^2 = g S^-1
+    g of its turn at x_0.
     """
     first = track.arcs
     impacts = len(track.arcs.instants) - 2
@@ -158,7 +158,9 @@ def _with_velocities(
     before, after = arcs.velocities()
     impacts = len(before)
     gain = np.zeros((impacts, 3, 6, len(covariance)))
-    of_places, of_turns = places_and_turns(gain.swapaxes(2, 3))  # views of it
+    by_column = gain.swapaxes(2, 3)
+    of_places = place_of(by_column)  # views of it
+    of_turns = turning_of(by_column)
     of_places[:, :, :free] = arcs.gain_with_places().swapaxes(2, 3)
     rows = arcs.rows_of_instants()
     times = arcs.instants_of_impacts + track.t.mean()

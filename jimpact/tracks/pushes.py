@@ -11,9 +11,9 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from jimpact.bodies.base import Body
+from jimpact.bodies.rigid import place_of, quaternion_of, turning_of
 from jimpact.core.scene import Scene, dense_mass
 from jimpact.shots.data import ROUNDING
-from jimpact.tracks.quaternions import places_and_turns
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard
 # errors. Ten times more would pass impacts with something else than the contacts.
@@ -149,8 +149,7 @@ def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
     """A pose after a step (n,): of coordinates, or of places and a turn of the body."""
     if len(pose) == len(step):
         return pose + step
-    place, e = places_and_turns(pose)
-    displacement, turn = places_and_turns(step)
-    before = Rotation.from_quat(e, scalar_first=True)
-    after = before * Rotation.from_rotvec(turn)
-    return np.append(place + displacement, after.as_quat(scalar_first=True))
+    before = Rotation.from_quat(quaternion_of(pose), scalar_first=True)
+    after = before * Rotation.from_rotvec(turning_of(step))
+    place = place_of(pose) + place_of(step)
+    return np.append(place, after.as_quat(scalar_first=True))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jimpact.bodies.rigid import place_of, quaternion_of
 from jimpact.tools.checks import check_choice
 from jimpact.tracks.frames import neighbours
 
@@ -25,8 +26,7 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
             f"Argument `q` must have shape (T, 7), x, y, z and a quaternion, as "
             f"`quaternion` is given, but has shape {q.shape}."
         )
-    places, turns = places_and_turns(q)
-    e = turns[:, np.roll(ORDERS[order], 1)]
+    e = quaternion_of(q)[:, np.roll(ORDERS[order], 1)]
     length = np.linalg.norm(e, axis=1)
     far = np.abs(length - 1) > LENGTH_WITHIN  # no where a frame is lost
     if far.any():
@@ -36,12 +36,7 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
             f"{k + 1} has length {length[k]:.4g}. Are these angles? A lost frame must "
             f"be NaN, not 0."
         )
-    return places, e / length[:, None]
-
-
-def places_and_turns(x: Any) -> tuple[Any, Any]:
-    """Parts (.., 3) and (.., 3 or 4): places and turns of poses, steps, velocities."""
-    return x[..., :3], x[..., 3:]
+    return place_of(q), e / length[:, None]
 
 
 def as_inertia(inertia: Any) -> np.ndarray | None:

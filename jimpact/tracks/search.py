@@ -42,8 +42,9 @@ BEST_WINDOWS = 0.25
 # Residuals of arcs that meet, in errors of the flights alone, from which on one flight
 # is none. Ten times more would pass arcs that miss one another.
 UNMET = 2.0
-# Windows by which a first acceleration is found begin at so many places of a track, or
-# fewer. Ten times more: as long as a search takes; a third: they may miss the flights.
+# Of windows by which a first acceleration is found: their five frames lie this part of
+# the track apart, at most as many frames as a flight has. Ten times less: they are next
+# to each other, and noise hides the parabola; ten times more: windows hold impacts.
 MOST_STRIDES = 32
 
 
@@ -115,7 +116,7 @@ def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
     """
     if not flight.unknown.any():
         return flight
-    stride = min(max(1, round(len(frames.t) / MOST_STRIDES)), shortest)
+    stride = _stride(frames, shortest)
     tried = []
     for k in {max(1, stride // 2), stride, 2 * stride}:
         found = np.array([curvature(frames.t, x, k) for x in frames.q.T])
@@ -123,6 +124,11 @@ def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
     if len(tried) > 1:
         tried.sort(key=lambda a: divided(frames, a, shortest).cost)
     return flight.with_values(tried[0], flight.drag)
+
+
+def _stride(frames: Frames, shortest: int) -> int:
+    """Number of frames from one to the next of the five of a window."""
+    return min(max(1, round(len(frames.t) / MOST_STRIDES)), shortest)
 
 
 def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
@@ -207,7 +213,7 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
             f"Argument `q` must hold a flight, but no frames in a row lie on an arc "
             f"within sigma = {[float(f'{x:.2g}') for x in frames.sigma]} at an "
             f"acceleration of {flight.acceleration.tolist()}: "
-            f"{_likely_cause(frames, flight)}"
+            f"{_likely_cause(frames, flight, settings.shortest)}"
         )
     free = free_flights(straight, flight.acceleration, flights)
     verdict = judged(straight, free, flight, settings.estimated)
@@ -217,20 +223,20 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
     return Search(frames, flight, settings, flights, verdict)
 
 
-def _likely_cause(frames: Frames, flight: Flight) -> str:
-    """Question about t, the sign or the unit: by the second differences of q over dt^2.
+def _likely_cause(frames: Frames, flight: Flight, shortest: int) -> str:
+    """Question about t, the sign or the unit: by the `curvature` of frames.
 
-    Their median is that of the frames of flights, along the axis of the largest given
-    acceleration. Its opposite: the sign; 100 or 1 000 times it: the unit. Steps dt of a
-    whole number of seconds, one or more: t may count frames.
+    It is that along the axis of the largest given acceleration. Its opposite: the sign;
+    100 or 1 000 times it: the unit. Steps dt of a whole number of seconds, one or more:
+    t may count frames.
     """
     step = frames.step
     axis = int(np.argmax(np.abs(flight.acceleration)))
     given = float(flight.acceleration[axis])
-    seen = float(np.nanmedian(np.diff(frames.q[:, axis], 2)) / step**2)
     if step >= 1 and step == round(step):
         return f"are the steps of t, {step:g} s, numbers of frames?"
-    if given == 0:
+    seen = curvature(frames.t, frames.q[:, axis], _stride(frames, shortest))
+    if given == 0 or seen == 0:
         return "are these the units of q and t?"
     ratio = seen / given
     if abs(ratio + 1) < SAME_SIZE:

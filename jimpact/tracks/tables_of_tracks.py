@@ -80,9 +80,8 @@ def read(
         rate: frames a second, > 0; without `frame` each line is one. A rate that the
             file states must be this.
         unit: of the columns, one for all or one each: m, cm, mm, um, in, ft, rad, deg,
-            or 1
-            of a quaternion. It is never guessed; a unit that the file or a name ('x
-            [mm]') states must be this. None: as stated there.
+            or 1 of a quaternion. It is never guessed; a unit that the file or a name
+            ('x [mm]') states must be this. None: as stated there.
         decimal: '.' or ','.
         where: of a long table with a row for each body and frame: the column, and what
             it must hold, `{"body": "A"}`; other rows are left out.

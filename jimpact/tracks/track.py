@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from jimpact.bodies.base import Body
+from jimpact.bodies.rigid import place_of, quaternion_of
 from jimpact.core.scene import Scene, dense_mass
 from jimpact.shots.covariances import covariance_of
 from jimpact.shots.data import Experiments
@@ -20,7 +21,6 @@ from jimpact.tracks.held import held_flights
 from jimpact.tracks.pushes import Pushes, slopes_in_pose
 from jimpact.tracks.quaternions import (
     in_the_other_order,
-    places_and_turns,
     turns_since_first,
 )
 
@@ -57,12 +57,11 @@ class TrackImpact:
 
         omega becomes A omega, with A of `in_the_other_order`; its covariance follows.
         """
-        place, e = places_and_turns(self.q)
-        other, A = in_the_other_order(e, order)
+        other, A = in_the_other_order(quaternion_of(self.q), order)
         one = np.eye(3)  # of places, before and after
         gain = block_diag(one, A, one, A)
         pre, post = np.split(gain @ np.concatenate([self.pre, self.post]), 2)
-        q = np.append(place, other)
+        q = np.append(place_of(self.q), other)
         covariance = gain @ self.covariance @ gain.T
         return replace(self, q=q, pre=pre, post=post, covariance=covariance)
 
@@ -112,8 +111,8 @@ class Track:
         """
         if self.order is None:
             return self.q
-        places, e = places_and_turns(self.q)
-        return np.hstack([places, turns_since_first(e)])
+        turns = turns_since_first(quaternion_of(self.q))
+        return np.hstack([place_of(self.q), turns])
 
     @property
     def acceleration(self) -> np.ndarray:
