@@ -21,7 +21,7 @@ from jimpact.fits.parts_of_motion import OF_A_MOTION
 from jimpact.fits.search import Search
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.tools.checks import check_word, suggestion
+from jimpact.tools.checks import check_choice, check_word, suggestion
 from jimpact.tools.study_tables import check_keys, check_kind
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
@@ -35,7 +35,7 @@ NO_DATA = (
 
 
 class WrongOption(ValueError):
-    """An option of the command line is wrong, not the study."""
+    """An argument beside the study is wrong, not the study."""
 
 
 def located(path: Path, table: str) -> Path:
@@ -165,7 +165,7 @@ def law_of(
     name = (other_law or study_law).lower()
     check_word("the law", study_law, REGISTRY)
     try:
-        check_word("--law", name, REGISTRY)
+        check_choice("law", name, REGISTRY)
     except ValueError as error:
         raise WrongOption(str(error)) from None
     others = ("name", "module", "bounds", "priors")

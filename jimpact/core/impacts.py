@@ -596,6 +596,7 @@ def raise_on_failure(out: OutcomeT) -> OutcomeT:
 
     Raises:
         RuntimeError: a status that is a failure; with the places in the batch.
+        TypeError: a traced status: inside jit read `out.status`.
 
     >>> import jimpact as ji
     >>> apart = ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 1.0])

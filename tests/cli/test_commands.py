@@ -547,7 +547,7 @@ def test_laws(capsys, tmp_path, monkeypatch):
         (["fit", "--out", "fit.docx"], "--out must end in .png, .pdf or .svg"),
         (["fit", "--limit", "0"], "--limit must be > 0 seconds"),
         (["fit", "--json", "--csv"], "--json and --csv must not both be given"),
-        (["fit", "--law", "aristotle"], "fit: --law must be one of"),
+        (["fit", "--law", "aristotle"], "fit: Argument `law` must be one of"),
         (["compare", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["compare", "--velocity", "1", "0"], "`velocity` must have shape (3,)"),
         (["compare", "--velocity", "1", "nan", "0"], "`velocity` must be finite"),
@@ -583,7 +583,7 @@ def test_refused(capsys, arguments, message):
 
 MISSPELLED = [
     (["fti"], "jimpact: the command must be one of fit, compare", "Did you mean fit?"),
-    (["fit", "--law", "Newtn"], "--law must be one of lzb", "Did you mean newton?"),
+    (["fit", "--law", "Newtn"], "`law` must be one of lzb", "Did you mean newton?"),
     (["fit", "--method", "adm"], "`method` must be one of", "Did you mean adam?"),
     (["fit", "three_bals.toml"], "does not exist", "Did you mean three_balls.toml?"),
     (
