@@ -631,7 +631,7 @@ class _Problem:
             products = terms[:, :, None] * weighted[:, None]
             where = np.append(own, width - 1)
             at = np.ix_(flights, where, where)
-            grams[at] += np.add.reduceat(products, covariance.starts, axis=0)
+            grams[at] += np.add.reduceat(products, covariance.flights.starts, axis=0)
         return self._solved(grams, ends, moving)
 
     def _solved(

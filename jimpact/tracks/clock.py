@@ -46,7 +46,7 @@ def with_clock(arcs: Arcs, frames: Frames) -> tuple[Frames, float]:
     speed = velocities(arcs, frames) / arcs.errors.sigma
     square = speed**2
     rest = arcs.residual**2
-    ok = np.isfinite(rest) & np.isfinite(square) & (arcs.errors.waves == 0)
+    ok = np.isfinite(rest) & np.isfinite(square) & ~arcs.errors.waving
     x = square[ok]
     y = rest[ok]
     if len(y) < FEWEST or not np.ptp(x):
@@ -66,5 +66,5 @@ def with_clock(arcs: Arcs, frames: Frames) -> tuple[Frames, float]:
     ratio = float(np.exp(best.x)) / square[ok].max()
     size = float(np.mean(y / (1 + ratio * square[ok])))
     spread = size * (1 + ratio * np.nan_to_num(square))
-    spread[:, arcs.errors.waves > 0] = 1.0
+    spread[:, arcs.errors.waving] = 1.0
     return frames.with_relative(np.sqrt(spread)), float(np.sqrt(size * ratio))

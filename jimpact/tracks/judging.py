@@ -303,7 +303,7 @@ def _of_curvatures(t: np.ndarray, arcs: Arcs) -> list[str]:
     excess, error = excess_of(t, arcs.residual, arcs.errors.sigma, arcs.members)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
-    far[:, arcs.errors.waves > 0] = False
+    far[:, arcs.errors.waving] = False
     far |= arcs.bent
     excess = np.where(arcs.bent, arcs.own[:-1], excess)
     rows = arcs.size * np.arange(len(arcs.members))[:, None] + n + 1 + np.arange(n)
@@ -338,11 +338,13 @@ def _of_waves(arcs: Arcs) -> list[str]:
     """Findings of coordinates in which flights have waves."""
     errors = arcs.errors
     return [
-        f"Flights wave in coordinate {c + 1}, by {errors.waves[c]:.2g} over "
-        f"{errors.times[c]:.2g} s beside noise of {errors.sigma[c]:.2g}: perhaps a "
-        f"table that is not level, a lens, drag, spin, a moving camera or times that "
-        f"err. The errors hold this."
-        for c in np.flatnonzero(errors.waves)
+        f"Flights wave in coordinate {c + 1}, by "
+        f"{' and by '.join(f'{w.size:.2g} over {w.time:.2g} s' for w in waves)} beside "
+        f"noise of {errors.sigma[c]:.2g}: perhaps a table that is not level, a lens, "
+        f"drag, spin, a body that wobbles, a moving camera or times that err. The "
+        f"errors hold this."
+        for c, waves in enumerate(errors.waves)
+        if waves
     ]
 
 
@@ -354,7 +356,7 @@ def _of_sizes(arcs: Arcs) -> list[str]:
     are named.
     """
     flights = len(arcs.members)
-    plain = arcs.errors.waves == 0
+    plain = ~arcs.errors.waving
     n = int(plain.sum())
     # parameters of a flight: places and instants are shared with its neighbours
     taken = (n * (flights + 1) + flights - 1) / flights

@@ -82,30 +82,42 @@ class Search:
 
     @property
     def leaves_a_flight(self) -> bool:
-        """True if so many frames in a row as a flight has, between flights, fit
-        none.
+        """True if so many frames in a row as a flight has, between flights, fit none.
+
+        Those of a contact aside.
         """
-        rows = np.concatenate(self.verdict.flights)
-        seen = np.flatnonzero(self.frames.seen)
-        used = np.isin(seen, rows)
-        places = np.flatnonzero(used)
-        return bool((np.diff(places) > self.settings.shortest).any())
+        flights = self.verdict.flights
+        contact = self.settings.contact
+        for before, after in pairwise(flights):
+            between = slice(before[-1] + 1, after[0])
+            lost = int(self.frames.seen[between].sum())
+            lasting = self.frames.t[after[0]] - self.frames.t[before[-1]]
+            if lost >= self.settings.shortest and lasting > contact:
+                return True
+        return False
 
     def agrees_with(self, flight: Flight, least: np.ndarray) -> bool:
         """True if frames were divided by the errors, `least` or more, and the model
         they gave.
+
+        Accelerations agree where they bend flights by less than sigma, or a tenth of
+        the waves; of flights that all have their own any do.
         """
         used = self.frames.sigma
-        given = np.maximum(self.verdict.errors.sigma, least)
+        errors = self.verdict.errors
+        given = np.maximum(errors.sigma, least)
         same = (np.abs(given - used) <= AGREEING * used).all()
         longest = max(np.ptp(self.frames.t[some]) for some in self.verdict.flights)
         bend = np.abs(flight.acceleration - self.flight.acceleration) * longest**2 / 8
+        bend[self.verdict.bent.all(axis=0)] = 0.0
+        largest = [max([w.size for w in some], default=0.0) for some in errors.waves]
+        unseen = np.maximum(used, AGREEING * np.array(largest))
         if self.frames.seen.any():
             speed = np.ptp(self.frames.q[self.frames.seen], axis=0)
         else:
             speed = 0.0
         slowing = abs(flight.drag - self.flight.drag) * np.max(speed) ** 2 / 8
-        return bool(same and (bend < used).all() and slowing < used.max())
+        return bool(same and (bend < unseen).all() and slowing < used.max())
 
 
 def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
@@ -343,10 +355,11 @@ def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
             start, instants=instants, instant_errors=np.zeros_like(instants)
         )
         return fit_arcs(frames, still)
-    waves = start.errors.waves > 0
+    waves = start.errors.waving
     if not waves.any() or len(start.flights) < 2:
         return fit_arcs(frames, start)
-    near = max(FEWEST_LOCAL, int(LOCAL * start.errors.times[waves].min() / frames.step))
+    shortest = min(wave.time for some in start.errors.waves for wave in some)
+    near = max(FEWEST_LOCAL, int(LOCAL * shortest / frames.step))
     white = Errors.white(start.errors.sigma)
     model = replace(start.flight, drag_unknown=False, unknown=np.zeros_like(waves))
     bent = np.ones((2, len(waves)), bool)
@@ -401,7 +414,7 @@ def of_residuals(arcs: Arcs, frames: Frames) -> np.ndarray:
     freedom = np.maximum(_freedom(arcs) - 2, 2.0)
     scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
     found = np.maximum(sigma * scale, least_noise(frames.q))
-    return np.where(arcs.errors.waves > 0, sigma, found)
+    return np.where(arcs.errors.waving, sigma, found)
 
 
 def of_most_flights(arcs: Arcs) -> np.ndarray:

@@ -9,19 +9,22 @@ and falls as its fourth power above: waves are as slow as T, and not slower, as 
 are the business of the flights' lines and parabolas. Waves of different flights are
 independent.
 
+A coordinate may have slow waves, as of a lens, and quick ones beside them, as of a body
+that wobbles: C has a term for each.
+
 The oscillator has a place f and a velocity g: C^-1 of N frames takes a banded matrix of
-2 N rows (Hartikainen and Saerkkae, MLSP 2010; Foreman-Mackey et al., AJ 154, 2017), at
-any times.
+2 N rows for each wave (Hartikainen and Saerkkae, MLSP 2010; Foreman-Mackey et al., AJ
+154, 2017), at any times.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Chebyshev
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-BANDS = 3  # above the diagonal: (f, g) of a frame and of the next one
 # Damping b of waves. Of lenses on level tables errors are then .8 times as large as
 # stated, of critical damping, 1, half of that: slow drifts, which are none, make them.
 # A third of it is a wave of one length.
@@ -34,23 +37,55 @@ SHORT = 2.0
 DEGREE = 14
 
 
+class Wave(NamedTuple):
+    """Waves of a coordinate: their size w, in the unit that is named, and time T
+    [s].
+    """
+
+    size: float
+    time: float
+
+    def scaled(self, factor: float) -> "Wave":
+        """Waves so many times as large."""
+        return Wave(factor * self.size, self.time)
+
+
 @dataclass(frozen=True)
 class Errors:
-    """Standard errors (n,) of each coordinate: white sigma, waves w, and their time T
-    [s].
+    """Errors of each coordinate: white ones of standard error sigma (n,), and its
+    waves.
 
-    `clock`: standard error of the times of frames [s], which is part of sigma.
+    `waves` are those of each coordinate, in its unit, the slow ones first; none where
+    it is empty. `clock`: standard error of the times of frames [s], which is part of
+    sigma.
     """
 
     sigma: np.ndarray
-    waves: np.ndarray
-    times: np.ndarray
+    waves: tuple[tuple[Wave, ...], ...]
     clock: float = 0.0
 
     @classmethod
     def white(cls, sigma: np.ndarray) -> "Errors":
         """Errors without waves."""
-        return cls(sigma, np.zeros_like(sigma), np.ones_like(sigma))
+        return cls(sigma, ((),) * len(sigma))
+
+    @property
+    def waving(self) -> np.ndarray:
+        """True (n,) for coordinates that have waves."""
+        return np.array([bool(some) for some in self.waves])
+
+    @property
+    def speeds_of_waves(self) -> np.ndarray:
+        """Velocities (n,) of the waves of each coordinate, root mean square: each
+        wave's is `w / T`.
+        """
+        squares = [sum((w.size / w.time) ** 2 for w in some) for some in self.waves]
+        return np.sqrt(np.array(squares, float))
+
+    @property
+    def number_of_waves(self) -> int:
+        """Number of waves of all coordinates."""
+        return sum(map(len, self.waves))
 
     def of(
         self,
@@ -64,81 +99,131 @@ class Errors:
 
         `relative` (N,): white errors of these frames in sigma; None: 1.
         """
-        return Covariance(
-            t, starts, self.sigma[c], self.waves[c], self.times[c], relative
-        )
+        return Covariance(Flights(t, starts), self.sigma[c], self.waves[c], relative)
 
 
 @dataclass(frozen=True)
-class Covariance:
-    """Covariance C of the errors of one coordinate in the frames t (N,) of F flights in
-    turn.
+class Flights:
+    """Times t (N,) of the frames of F flights in turn, and their first frames `starts`
+    (F,).
 
-    Fields: `starts` (F,), the first frame of each flight; white sigma; waves w; their
-    time T [s]; `relative` (N,): white errors of frames in sigma; None: 1.
+    Steps of waves are kept by their time, as waves of several sizes are tried.
     """
 
     t: np.ndarray
     starts: np.ndarray
+    known: dict[float, "Steps"] = field(default_factory=dict, repr=False)
+
+    def steps(self, time: float) -> "Steps":
+        """Waves of this time from frame to frame."""
+        if time not in self.known:
+            self.known[time] = steps_of(self.t, self.starts, time)
+        return self.known[time]
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance C of the errors of one coordinate in the N frames of F flights.
+
+    Fields: the flights; white sigma; `waves`, M of them, in the unit of sigma;
+    `relative` (N,): white errors of frames in sigma; None: 1.
+    """
+
+    flights: Flights
     sigma: float
-    wave: float
-    time: float
+    waves: tuple[Wave, ...] = ()
     relative: np.ndarray | None = None
 
     @property
     def weights(self) -> np.ndarray:
         """`1 / relative^2` (N,)."""
-        return np.ones(len(self.t)) if self.relative is None else self.relative**-2.0
+        if self.relative is None:
+            return np.ones(len(self.flights.t))
+        return self.relative**-2.0
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """`C^-1 x` (N, m) of columns x.
 
-        Equation: with f the most likely waves and the weights u, `u (x - f) / sigma^2`.
+        Equation: with f_j the most likely waves and the weights u,
+        `u (x - sum_j f_j) / sigma^2`.
         """
         weights = self.weights[:, None]
-        if not self.wave:
+        if not self.waves:
             return weights * x / self.sigma**2
-        sides = np.zeros((2 * len(x), x.shape[1]))
-        sides[::2] = weights * x
-        waves = cho_solve_banded((self._factor, False), sides, check_finite=False)
-        return weights * (x - waves[::2]) / self.sigma**2
+        count = len(self.waves)
+        sides = np.zeros((len(x), count, 2, x.shape[1]))
+        sides[:, :, 0] = (weights * x)[:, None]
+        flat = sides.reshape(-1, x.shape[1])
+        found = cho_solve_banded((self._factor, False), flat, check_finite=False)
+        places = found.reshape(sides.shape)[:, :, 0]
+        return weights * (x - places.sum(axis=1)) / self.sigma**2
 
     def log_det(self) -> np.ndarray:
         """`log |C|` (F,) of each flight.
 
-        Equation: `log |S| + log |P / w^2 + S^-1| - log |P / w^2|`, P the precision of
-        unit (f, g), S = sigma^2 / u the white variances.
+        Equation: `log |S| + log |P + S^-1| - log |P|`, P the precision of (f_j, g_j) of
+        all waves, S = sigma^2 / u the white variances.
         """
-        own = 2 * np.log(self.sigma) - np.log(self.weights)
-        if not self.wave:
-            return np.add.reduceat(own, self.starts)
-        white = 4 * np.log(self.wave) - 4 * np.log(self.sigma) + own
-        diagonal = 2 * np.log(self._factor[-1]).reshape(-1, 2).sum(axis=1)
-        return np.add.reduceat(white + diagonal + self._steps.log_det, self.starts)
+        found = 2 * np.log(self.sigma) - np.log(self.weights)
+        if self.waves:
+            for wave, steps in zip(self.waves, self._steps):
+                found = found + 4 * np.log(wave.size / self.sigma) + steps.log_det
+            pivots = np.log(self._factor[-1]).reshape(len(found), -1)
+            found = found + 2 * pivots.sum(axis=1)
+        return np.add.reduceat(found, self.flights.starts)
 
-    @cached_property
-    def _steps(self) -> "Steps":
-        """The process from frame to frame."""
-        return steps_of(self.t, self.starts, self.time)
+    @property
+    def _steps(self) -> list["Steps"]:
+        """Each wave from frame to frame."""
+        return [self.flights.steps(wave.time) for wave in self.waves]
 
     @cached_property
     def _factor(self) -> np.ndarray:
-        """Cholesky factor of `(sigma / w)^2 P + u`, u the weights of f: upper bands (4,
-        2 N)."""
-        ratio = (self.sigma / self.wave) ** 2
-        bands = ratio * self._steps.bands
-        bands[-1, ::2] += self.weights
-        return cholesky_banded(bands, check_finite=False)
+        """Cholesky factor of `sigma^2 P + H^T u H`: upper bands (2 M + 2, 2 M N).
+
+        P is the precision of (f_1, g_1, f_2, g_2, ..) of a frame after the other, H
+        adds the f_j of a frame, u are its weights.
+        """
+        rows = 2 * len(self.waves)  # of a frame
+        bands = np.zeros((rows + 2, rows * len(self.flights.t)))
+        for j, (wave, steps) in enumerate(zip(self.waves, self._steps)):
+            steps.add_to(bands, 2 * j, rows, (self.sigma / wave.size) ** 2)
+        # f_i with f_j of the same frame
+        for j in range(0, rows, 2):
+            for i in range(0, j + 2, 2):
+                bands[-1 - (j - i), j::rows] += self.weights
+        return cholesky_banded(bands, overwrite_ab=True, check_finite=False)
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Unit waves: bands (4, 2 N) of their precision P, and `log |Q|` (N,) of each
-    step.
+    """Unit waves: precision P of their (f, g), and `log |Q|` (N,) of each step.
+
+    Fields: P (N, 3) of a frame, `ff, fg, gg`, and (N, 4) of f, g of a frame with f, g
+    of the next one, `ff, fg, gf, gg`; the last row is 0.
     """
 
-    bands: np.ndarray
+    of_frame: np.ndarray
+    with_next: np.ndarray
     log_det: np.ndarray
+
+    def add_to(self, bands: np.ndarray, first: int, rows: int, factor: float) -> None:
+        """Add `factor` P to upper bands of a matrix with so many `rows` a frame, those
+        of these waves from `first` on.
+        """
+        ff, fg, gg = factor * self.of_frame.T
+        f = slice(first, None, rows)
+        g = slice(first + 1, None, rows)
+        bands[-1, f] += ff
+        bands[-1, g] += gg
+        bands[-2, g] += fg
+        ff, fg, gf, gg = factor * self.with_next[:-1].T
+        next_f = slice(rows + first, None, rows)
+        next_g = slice(rows + first + 1, None, rows)
+        bands[-1 - rows, next_f] += ff
+        bands[-1 - rows, next_g] += gg
+        bands[-rows, next_f] += gf
+        bands[-2 - rows, next_g] += fg
 
 
 def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
@@ -180,20 +265,11 @@ def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
     own_ff[:-1] -= (a_ff * m_ff + a_gf * m_gf)[following]
     own_fg[:-1] -= (a_ff * m_fg + a_gf * m_gg)[following]
     own_gg[:-1] -= (a_fg * m_fg + a_gg * m_gg)[following]
-    bands = np.zeros((BANDS + 1, 2 * len(t)))
-    main, one, two, three = bands[::-1]
-    f = slice(0, None, 2)  # rows of the values f of frames
-    g = slice(1, None, 2)
-    next_f = slice(2, None, 2)
-    next_g = slice(3, None, 2)
-    main[f] = own_ff
-    main[g] = own_gg
-    one[g] = own_fg
-    one[next_f] = m_fg[following]  # g of a frame with f of the next one
-    two[next_f] = m_ff[following]
-    two[next_g] = m_gg[following]
-    three[next_g] = m_gf[following]
-    return Steps(bands, np.log(det))
+    of_frame = np.column_stack([own_ff, own_fg, own_gg])
+    with_next = np.zeros((len(t), 4))
+    # the rows of m are those of the next frame
+    with_next[:-1] = np.column_stack([m_ff, m_gf, m_fg, m_gg])[following]
+    return Steps(of_frame, with_next, np.log(det))
 
 
 def _free(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
