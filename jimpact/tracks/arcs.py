@@ -300,6 +300,11 @@ class Start:
     instants: np.ndarray | None = None
     instant_errors: np.ndarray | None = None
 
+    def without(self, k: int) -> "Start":
+        """The same without flight k, whose frames are left out."""
+        flights = [*self.flights[:k], *self.flights[k + 1 :]]
+        return replace(self, flights=flights, bent=np.delete(self.bent, k, axis=0))
+
     def joined_at(self, k: int) -> "Start":
         """The same with flights k and k + 1 as one."""
         two = slice(k, k + 2)

@@ -41,6 +41,11 @@ def price(frames: int, n: int) -> float:
     return max(float((2 * n + 1) * np.log(frames)), SMALLEST_JUMP**2)
 
 
+def price_of_lost(n: int) -> float:
+    """Price in chi^2 of a frame of n coordinates that fits no flight."""
+    return float(chi2.isf(LOST_SHARE, n))
+
+
 @dataclass(frozen=True)
 class Division:
     """Flights (frames of each), and the cost of the cheapest division: chi^2 and
@@ -106,7 +111,7 @@ class _Search:
         # two frames have twice that
         self.least_spread = float(np.diff(frames.t).min()) ** 2 / 4
         self.price = price(count, n)
-        self.lost = chi2.isf(LOST_SHARE, n) * self.good.any(axis=1)
+        self.lost = price_of_lost(n) * self.good.any(axis=1)
         self.best = np.zeros(count + 1)
         self.come = np.zeros(count + 1, int)
         self.starts = _Starts(np.zeros(0, int), np.zeros((6, 0, n)))

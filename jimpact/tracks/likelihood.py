@@ -33,10 +33,11 @@ ROUNDED = 1e-12
 # Frames by which slow waves are looked for; more are taken together. Ten times more
 # take ten times as long, and waves are slow.
 MOST_FRAMES = 150
-# Frames by which quick waves are looked for, in pieces of flights of some twenty of the
-# shortest waves. Ten times more take ten times as long.
+# Frames by which quick waves are looked for, in pieces of flights of four periods of the
+# shortest ones: their parabolas take slow waves away. Of ten times more they do not,
+# and take ten times as long.
 QUICK_FRAMES = 1024
-PIECE = 256
+PIECE = 128
 # Least time of slow waves beside quick ones, in times of these. Of ten times more few
 # are slow; of equal times there is one wave.
 SLOWER = 3.0
@@ -319,7 +320,10 @@ class Likelihood:
         """
         pieces = self.some.in_pieces(PIECE, QUICK_FRAMES)
         bent = np.ones(len(pieces.starts), bool)
-        some = Likelihood(pieces, self.noise(), self.least, self.fastest, bent)
+        sigma = self.noise()
+        some = Likelihood(pieces, sigma, self.least, self.fastest, bent)
+        if not some.shows_waves(sigma):
+            return ()
         return some.best_waves(LEAST_TIME * step)
 
     def noise(self) -> float:
@@ -406,10 +410,13 @@ class Likelihood:
             best = min(best, here)
         if len(best.waves) == len(beside):
             return ()
-        coarse = best.relative[0]
         for factor in FINER:
-            finer = Wave(coarse.size, coarse.time * factor)
-            best = min(best, self._best_size(finer, beside))
+            here = best
+            while here is best and best.waves[0].time >= shortest:
+                coarse = best.relative[0]
+                finer = Wave(coarse.size, coarse.time * factor)
+                here = self._best_size(finer, beside)
+                best = min(best, here)
         if without.cost - best.cost < self.price_of_waves:
             return ()
         return best.waves[:1]

@@ -8,8 +8,8 @@ import numpy as np
 
 from jimpact.tracks.arcs import Arcs, Start, crossings, fit_arcs
 from jimpact.tracks.clock import with_clock
-from jimpact.tracks.division import SMALLEST_JUMP, divided
-from jimpact.tracks.evidence import Verdict, doubtful, judged
+from jimpact.tracks.division import SMALLEST_JUMP, divided, price_of_lost
+from jimpact.tracks.evidence import Verdict, doubtful, judged, likely_errors
 from jimpact.tracks.flight import Flight
 from jimpact.tracks.frames import Frames, differences, least_noise, median
 from jimpact.tracks.held import free_flights
@@ -265,14 +265,16 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     1. Fit the arcs; first at fixed instants, as nothing determines one without a jump.
     2. Join two flights without a jump of SMALLEST_JUMP, or as `_without_false` says;
        fit again.
-    3. Take the errors of the residuals, where they are unknown or clearly larger, and
+    3. Find the errors again, where flights were joined; fit again.
+    4. Take the errors of the residuals, where they are unknown or clearly larger, and
        those of times, where residuals grow with the speed; fit again.
     """
     verdict = search.verdict
     contact = search.settings.contact
-    start = Start(
-        verdict.flights, verdict.flight, verdict.errors, verdict.bent, contact
-    )
+    # where all flights have an acceleration of their own a common one is not another
+    unknown = verdict.flight.unknown & ~verdict.bent.all(axis=0)
+    flight = replace(verdict.flight, unknown=unknown)
+    start = Start(verdict.flights, flight, verdict.errors, verdict.bent, contact)
     moving = False
     while True:
         arcs = _arcs(search.frames, start, moving)
@@ -287,6 +289,9 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
         if joined is None:
             break
         start = joined
+    if len(start.flights) < len(verdict.flights):
+        start = with_likely_errors(search, start)
+        arcs = _arcs(search.frames, start)
     sigma = of_residuals(arcs, search.frames)
     given = start.errors.sigma
     larger = of_most_flights(arcs) > given * (
@@ -304,11 +309,23 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     return arcs, start.flights
 
 
+def with_likely_errors(search: Search, start: Start) -> Start:
+    """The start with the most likely errors, model and bends of its flights."""
+    straight = search.straight
+    speeds = straight.speeds(start.flights)
+    errors, flight, bent = likely_errors(
+        straight, start.flights, start.flight, search.settings.estimated, speeds
+    )
+    return replace(start, errors=errors, flight=flight, bent=bent)
+
+
 def _without_false(search: Search, arcs: Arcs, start: Start) -> Start | None:
-    """The start with a flight that is none joined to a neighbour; None: all are.
+    """The start with a flight that is none joined to a neighbour, or left out; None:
+    all are.
 
     A flight between two impacts whose instants leave it fewer frames than a flight has,
-    by more than one at each end. And where residuals are UNMET times the errors that
+    by more than one at each end; it is left out where its frames as lost ones cost
+    less. And where residuals are UNMET times the errors that
     flights alone have, that with the largest ones, if residuals are smaller without it:
     its arc misses others.
     """
@@ -321,7 +338,12 @@ def _without_false(search: Search, arcs: Arcs, start: Start) -> Start | None:
             continue  # the first and the last flight
         first, last = arcs.instants[i : i + 2]
         if ((t[some] >= first) & (t[some] <= last)).sum() < enough:
-            _, joined = _joined_best(search.frames, start, i)
+            square, joined = _joined_best(search.frames, start, i)
+            without = start.without(i)
+            rest = _arcs(search.frames, without).residual
+            n = len(arcs.errors.sigma)
+            if np.nansum(rest**2) + price_of_lost(n) * len(some) < square:
+                return without
             return joined
     if (of_residuals(arcs, search.frames) > UNMET * arcs.errors.sigma).any():
         sizes = [np.nanmean(arcs.residual[some] ** 2) for some in arcs.members]
@@ -347,7 +369,8 @@ def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
     alone.
 
     Unless `moving` instants stay where lines cross. Waves go on across an impact, so
-    that measured places meet there, though arcs are uncertain by the waves.
+    that measured places meet there, though arcs are uncertain by the waves; but where a
+    contact lasts longer they do not meet.
     """
     if not moving and start.instants is None:
         instants = crossings(frames, start.flights, start.flight)
@@ -360,6 +383,8 @@ def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
         return fit_arcs(frames, start)
     shortest = min(wave.time for some in start.errors.waves for wave in some)
     near = max(FEWEST_LOCAL, int(LOCAL * shortest / frames.step))
+    if start.contact > near * frames.step:
+        return fit_arcs(frames, start)  # frames that near would lie in the contact
     white = Errors.white(start.errors.sigma)
     model = replace(start.flight, drag_unknown=False, unknown=np.zeros_like(waves))
     bent = np.ones((2, len(waves)), bool)

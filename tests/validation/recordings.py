@@ -62,8 +62,12 @@ def gliders(
     noise: float,
     slope: float = 0.0,
     waves: float = 0.0,
+    wobble: float = 0.0,
 ) -> Recording:
-    """Two gliders of .2 and .3 kg, 2.4 s; a table with a slope [m/s^2], and waves of a lens [m]."""
+    """Two gliders of .2 and .3 kg, 2.4 s; a table with a slope [m/s^2], waves of a lens [m].
+
+    And gliders that wobble by so much at 16 Hz [m].
+    """
     at, masses = 1.2 + 0.1 * rng.random(), np.array([0.2, 0.3])
     v = np.array([0.5, -0.3])
     impulse = 1.8 * (v[0] - v[1]) / (1 / masses).sum()
@@ -74,6 +78,10 @@ def gliders(
     seen = q + noise * rng.normal(size=q.shape)
     if waves:
         seen += np.stack([lens(rng, x, waves) for x in q.T], axis=1)
+    if wobble:
+        phases = rng.uniform(0, 2 * np.pi, 2)
+        turned = -np.abs(since)  # the impact turns its velocity round
+        seen += wobble * np.sin(2 * np.pi * 16 * turned + phases)
     return Recording(t, seen, {}, np.array([at]), v[None], w[None])
 
 
@@ -182,6 +190,9 @@ SETTINGS: dict[str, Callable[[np.random.Generator], Recording]] = {
     "the same, lens of .15 mm": lambda rng: gliders(rng, 500, 2e-5, waves=1.5e-4),
     "the same, lens of .3 mm": lambda rng: gliders(rng, 500, 2e-5, waves=3e-4),
     "the same, both": lambda rng: gliders(rng, 500, 2e-5, slope=0.02, waves=1.5e-4),
+    "the same, both, and a wobble of .05 mm": lambda rng: gliders(
+        rng, 500, 2e-5, slope=0.02, waves=1.5e-4, wobble=5e-5
+    ),
     "pupils' gliders, 25 Hz, 1 mm, not level": lambda rng: gliders(
         rng, 25, 1e-3, slope=0.02
     ),
