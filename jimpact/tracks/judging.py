@@ -40,6 +40,11 @@ LOOKED_AT = 400
 MOST_BODIES = 6
 ALTERNATING = 10.0
 
+# Share of the flights on both sides that flights within one contact last at most, and
+# of the jumps by which velocities turn back within these. Ten times more: any impacts
+# are one.
+WITHIN = 0.2
+
 NO_IMPACT = "No impact was found"  # how its finding begins
 
 
@@ -198,8 +203,8 @@ def findings_of_bodies(q: np.ndarray) -> list[str]:
 def findings(
     search: Search, arcs: Arcs, used: Sequence[np.ndarray], noise: np.ndarray
 ) -> list[str]:
-    """Findings in a fitted track: curvatures, waves, large residuals, unused frames, no
-    impact.
+    """Findings in a fitted track: curvatures, waves, large residuals, contacts that
+    last, unused frames, no impact.
 
     `used`: frames of flights before a window; `noise` (n,): from frame to frame.
     """
@@ -209,6 +214,7 @@ def findings(
         *_of_curvatures(frames.t, arcs),
         *_of_waves(arcs),
         *_of_sizes(arcs),
+        *_of_lasting_contacts(arcs, frames.step),
         *unused,
     ]
     if search.settings.estimated and not arcs.flight.bends:
@@ -373,6 +379,41 @@ def _of_sizes(arcs: Arcs) -> list[str]:
                 f"false point was tracked."
             )
     return found + _of_times(arcs)
+
+
+def _of_lasting_contacts(arcs: Arcs, step: float) -> list[str]:
+    """Findings of impacts that push one after the other, as a spring does while it is
+    pressed. `step`: from frame to frame [s].
+
+    Flights between them last less than WITHIN of those on both sides. Of bounces the
+    velocity turns back in the flights between, here it does so by less than that share
+    of the jumps.
+    """
+    pre, post = arcs.velocities()
+    jumps = np.add(*neighbours(post - pre))
+    at = arcs.instants_of_impacts
+    before, _ = neighbours(post)
+    _, after = neighbours(pre)
+    back = -((after - before) * jumps).sum(axis=1)
+    onward = back < WITHIN * (jumps**2).sum(axis=1)
+    found = []
+    first = 0
+    for k in range(1, len(at) + 1):
+        if k < len(at) and onward[k - 1]:
+            continue
+        last = k - 1
+        lasting = at[last] - at[first]
+        outer = min(
+            at[first] - arcs.instants[first], arcs.instants[last + 2] - at[last]
+        )
+        if last > first and lasting < WITHIN * outer:
+            found.append(
+                f"Impacts {first + 1} to {last + 1} are pushes within {lasting:.2g} s: "
+                f"perhaps one contact that lasts, as of a spring or magnets. With "
+                f"contact={1.5 * lasting + 2 * step:.2g} it is one impact."
+            )
+        first = k
+    return found
 
 
 def _of_times(arcs: Arcs) -> list[str]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jimpact.tracks.flight import Flight
-from jimpact.tracks.frames import Frames, noise
+from jimpact.tracks.frames import Frames, median, noise
 from jimpact.tracks.waves import Covariance, Flights, Wave
 
 # Smallest size of waves, in sigma, and their times as shares of the longest flight.
@@ -33,9 +33,9 @@ ROUNDED = 1e-12
 # Frames by which slow waves are looked for; more are taken together. Ten times more
 # take ten times as long, and waves are slow.
 MOST_FRAMES = 150
-# Frames by which quick waves are looked for, in pieces of flights of four periods of the
-# shortest ones: their parabolas take slow waves away. Of ten times more they do not,
-# and take ten times as long.
+# Frames by which quick waves are looked for, in pieces of flights of four periods of
+# the shortest ones: their parabolas take slow waves away. Of ten times more they do
+# not, and take ten times as long.
 QUICK_FRAMES = 1024
 PIECE = 128
 # Least time of slow waves beside quick ones, in times of these. Of ten times more few
@@ -289,7 +289,7 @@ class Likelihood:
         paid = self.white().cost
         best = self.at(())
         for likely in found:
-            cost = likely.cost + len(likely.waves) * self.price_of_waves
+            cost = likely.cost + self.price_of_waves(len(likely.waves))
             if cost < paid:
                 paid = cost
                 best = likely
@@ -299,14 +299,18 @@ class Likelihood:
         self, step: float, beside: tuple[Wave, ...] = ()
     ) -> tuple[Wave, ...]:
         """The most likely waves, slower than those `beside`, by means of frames where
-        these are many; none unless they pay.
+        these are many, in the longer flights; none unless they pay.
         """
-        few, size = self.some.together(MOST_FRAMES)
+        # flights of half of all frames have so many or more
+        common = int(median(np.repeat(self.some.counts, self.some.counts)))
+        enough, taken = self.some.of_long_flights(common)
+        few, size = enough.together(MOST_FRAMES)
         if self.sigma is None and not beside:
             known = None
         else:
             known = self.noise() / size**0.5
-        binned = Likelihood(few, known, self.least / size**0.5, self.fastest, self.bent)
+        bent = self.bent[taken]
+        binned = Likelihood(few, known, self.least / size**0.5, self.fastest, bent)
         shortest = step * max(LEAST_TIME, LEAST_MEANS * size)
         for wave in beside:
             shortest = max(shortest, SLOWER * wave.time)
@@ -350,10 +354,15 @@ class Likelihood:
             return shown
         return given
 
-    @property
-    def price_of_waves(self) -> float:
-        """Cost that waves must save."""
-        return 2 * float(np.log(len(self.some.t))) + LEAST_SAVED
+    def price_of_waves(self, count: int) -> float:
+        """Cost that so many waves must save.
+
+        Those beside others LEAST_SAVED only: where the first ones are, others are
+        likely, and without them errors of velocities would be too small.
+        """
+        if not count:
+            return 0.0
+        return 2 * float(np.log(len(self.some.t))) + count * LEAST_SAVED
 
     def shows_waves(self, sigma: float) -> bool:
         """True if means of 4, 16, 64, .. frames in a row are larger than white errors
@@ -417,7 +426,9 @@ class Likelihood:
                 finer = Wave(coarse.size, coarse.time * factor)
                 here = self._best_size(finer, beside)
                 best = min(best, here)
-        if without.cost - best.cost < self.price_of_waves:
+        price = self.price_of_waves(len(best.waves))
+        price -= self.price_of_waves(len(beside))
+        if without.cost - best.cost < price:
             return ()
         return best.waves[:1]
 
@@ -480,7 +491,7 @@ class Likelihood:
             float(cost),
             sigma,
             tuple(wave.scaled(sigma) for wave in waves),
-            float(evidence) + len(waves) * self.price_of_waves,
+            float(evidence) + self.price_of_waves(len(waves)),
         )
 
     def _beside(self, waves: tuple[Wave, ...]) -> Likely:

@@ -1,5 +1,7 @@
 """How many impacts: waves, bends, lost frames, clocks that err, exact coordinates, what is doubtful."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -106,6 +108,42 @@ def test_waves_and_slopes_are_no_impacts():
             assert "candidates for an impact went" in str(track)
             assert track.arcs.errors.waving.all()
     assert np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_gliders_that_wobble_before_a_lens_have_slow_and_quick_waves():
+    """A wobble of .06 mm at 20 Hz beside waves of .15 mm, which one wave is not."""
+    rng = np.random.default_rng(12)
+    for _ in range(2):
+        t, q = gliders(rng, slope=0.03, waves=1.5e-4)
+        turned = -np.abs(t - 1.0)[:, None]  # the impact turns its velocity round
+        q = q + 6e-5 * np.sin(2 * np.pi * 20 * turned + rng.uniform(0, 6, 2))
+        track = ji.tracks.find_impacts(t, q)
+        (impact,) = track.impacts
+        assert np.abs(errors(impact, [0.6, -0.2], [-0.1, 0.4])).max() < 4
+        for slow, quick in track.arcs.errors.waves:
+            assert quick.time < 0.03 < slow.time
+
+
+def test_a_spring_that_is_pressed_is_told_to_be_one_contact():
+    """Two bodies of equal mass, e = 1, over a half period of .05 s; then one impact."""
+    rng = np.random.default_rng(13)
+    t = np.arange(1000) / 500
+    share = np.clip((t - 1.0) / 0.05, 0, 1)
+    pressed = 0.05 / np.pi * np.sin(np.pi * share)  # of the relative velocity 1
+    after = np.maximum(t - 1.05, 0.0)
+    apart = -np.minimum(t - 1.0, 0.0) - pressed + after
+    middle = 0.1 * t
+    q = np.stack([middle - apart / 2, middle + apart / 2], axis=1)
+    q = q + 2e-5 * rng.normal(size=q.shape)
+    track = ji.tracks.find_impacts(t, q, acceleration=[0.0, 0.0])
+    assert len(track.impacts) > 1
+    (told,) = [line for line in track.warnings if "contact=" in line]
+    contact = float(re.search(r"contact=([\d.]+)", told)[1])
+    (impact,) = ji.tracks.find_impacts(
+        t, q, acceleration=[0.0, 0.0], contact=contact
+    ).impacts
+    assert abs(impact.time - 1.025) < 1e-3
+    assert np.abs(errors(impact, [0.6, -0.4], [-0.4, 0.6])).max() < 3.5
 
 
 def test_frames_lost_at_the_impact_do_not_bound_its_instant():
