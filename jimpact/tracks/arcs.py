@@ -39,6 +39,9 @@ LARGEST_MOVE = 0.45
 # Share of a frame below which the instants have settled, and the places in their parts.
 # Ten times more is still far below noise.
 SETTLED = 1e-7
+# Share of the diagonal of the normal matrix by which it stays positive definite where
+# no frame lies between two instants. Ten times more is still far below noise.
+ROUNDED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -733,12 +736,16 @@ def _solve(
 
 
 def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Bands of `S A S`, S = diag(scale), so that units do not matter for rounding."""
+    """Bands of `S A S`, S = diag(scale), so that units do not matter for rounding.
+
+    ROUNDED is added to their diagonal, which is 1.
+    """
     width = bands.shape[0] - 1
     count = bands.shape[1]
     scaled = np.zeros_like(bands)
     for d in range(width + 1):
         scaled[width - d, d:] = bands[width - d, d:] * scale[d:] * scale[: count - d]
+    scaled[width] += ROUNDED
     return scaled
 
 

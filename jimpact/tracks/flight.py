@@ -47,6 +47,14 @@ class Flight:
         """The same model with other values of acceleration and drag."""
         return replace(self, acceleration=acceleration, drag=drag)
 
+    def without_common(self, own: np.ndarray) -> "Flight":
+        """The same model without an unknown acceleration in coordinates (n,) in which
+        all flights have their own.
+        """
+        own = own & self.unknown
+        acceleration = np.where(own, 0.0, self.acceleration)
+        return replace(self, acceleration=acceleration, unknown=self.unknown & ~own)
+
     def moved(self, change: np.ndarray) -> "Flight":
         """The same model after a change of what is unknown, in the order of
         `columns`.
@@ -56,6 +64,11 @@ class Flight:
         return self.with_values(
             self.acceleration + whole[:-1], self.drag + float(whole[-1])
         )
+
+    @property
+    def known_acceleration(self) -> np.ndarray:
+        """Acceleration (n,) that is given; 0 where it is found from the frames."""
+        return np.where(self.unknown, 0.0, self.acceleration)
 
     def air(self, drag: float) -> Force:
         """Acceleration that velocity makes, at a drag: `f(v) - k |v| v`."""

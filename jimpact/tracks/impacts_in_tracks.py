@@ -162,7 +162,7 @@ def find_impacts(
 
 def acceleration_is_known(flight: Flight) -> bool:
     """True where an acceleration is given, so that a body without it is held."""
-    return not flight.unknown.all() and bool(flight.acceleration.any())
+    return bool(flight.known_acceleration.any())
 
 
 def _model(

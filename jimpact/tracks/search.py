@@ -227,7 +227,7 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
             f"acceleration of {flight.acceleration.tolist()}: "
             f"{_likely_cause(frames, flight, settings.shortest)}"
         )
-    free = free_flights(straight, flight.acceleration, flights)
+    free = free_flights(straight, flight.known_acceleration, flights)
     verdict = judged(straight, free, flight, settings.estimated)
     verdict = verdict.of_flights(
         [np.ptp(frames.t[f]) > settings.contact for f in verdict.flights]
@@ -271,9 +271,7 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     """
     verdict = search.verdict
     contact = search.settings.contact
-    # where all flights have an acceleration of their own a common one is not another
-    unknown = verdict.flight.unknown & ~verdict.bent.all(axis=0)
-    flight = replace(verdict.flight, unknown=unknown)
+    flight = verdict.flight.without_common(verdict.bent.all(axis=0))
     start = Start(verdict.flights, flight, verdict.errors, verdict.bent, contact)
     moving = False
     while True:
@@ -316,6 +314,7 @@ def with_likely_errors(search: Search, start: Start) -> Start:
     errors, flight, bent = likely_errors(
         straight, start.flights, start.flight, search.settings.estimated, speeds
     )
+    flight = flight.without_common(bent.all(axis=0))
     return replace(start, errors=errors, flight=flight, bent=bent)
 
 

@@ -280,7 +280,8 @@ class Track:
         """True (K,) for impacts before and after which the body is free, not held."""
         n = len(self.acceleration)
         frames = Frames(self.t - self.t.mean(), self.q[:, :n], self.sigma[:n])
-        held = held_flights(frames, self.acceleration, self.flights)
+        known = self.arcs.flight.known_acceleration
+        held = held_flights(frames, known, self.flights)
         before, after = neighbours(held)
         return ~(before | after)
 
