@@ -5,14 +5,17 @@ are as in the file: x, y, z, and qx .. qw of rigid bodies. A marker that was los
 NaN, by each format's mark.
 """
 
-from collections.abc import Iterable, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice, takewhile
 from pathlib import Path
 
 import numpy as np
 
 from jimpact.tools.checks import needed, suggestion
 
+Lines = Iterator[tuple[int, str]]  # numbers of lines, from 1, and their text
 PLACE = ("x", "y", "z")
 TURN = ("qx", "qy", "qz", "qw")
 # Share of a step between frames to which times must agree with a rate that a file
@@ -120,7 +123,9 @@ def capture_of(path: Path) -> Capture | None:
     }
     for word, reader in readers.items():
         if text.strip('"').startswith(word):
-            return reader(path, path.read_bytes().decode("utf-8-sig", errors="replace"))
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
+                lines = enumerate((line.rstrip("\n") for line in file), 1)
+                return reader(path, lines)
     return None
 
 
@@ -135,17 +140,51 @@ def _number(path: Path, line: int, cell: str) -> float:
         raise ValueError(f"{path}, line {line}: {cell!r} must be a number.") from None
 
 
-def _rows(path: Path, lines: Iterable[tuple[int, list[str]]], width: int) -> np.ndarray:
-    """Numbers (T, width) of lines of cells; NaN where a line is shorter."""
-    found = []
-    for line, cells in lines:
+@dataclass(frozen=True)
+class _Rows:
+    """Numbers (T, width) of rows, and the last `digit` of their second cells, times
+    [s].
+    """
+
+    values: np.ndarray
+    digit: float
+
+
+def _rows(path: Path, rows: Iterable[tuple[int, list[str]]], width: int) -> _Rows:
+    """Numbers of rows of cells, one row after the other; NaN where one is shorter.
+
+    Rows without a cell that holds something are left out.
+    """
+    found = array("d")
+    digits = 0
+    for line, cells in rows:
+        if not any(cell.strip() for cell in cells):
+            continue
         row = [_number(path, line, cell) for cell in cells[:width]]
-        found.append(row + [np.nan] * (width - len(row)))
+        found.extend(row + [np.nan] * (width - len(row)))
+        if len(cells) > 1:
+            digits = max(digits, len(cells[1].strip().partition(".")[-1]))
     if not found:
         raise ValueError(
             f"{path}: there are no lines of numbers below the names of the markers."
         )
-    return np.array(found)
+    return _Rows(np.array(found).reshape(-1, width), 10.0**-digits)
+
+
+def _cells(lines: Lines, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of each line."""
+    for k, line in lines:
+        yield k, line.split(separator)
+
+
+def _head(path: Path, lines: Lines, separator: str, count: int) -> list[list[str]]:
+    """Cells, without blanks, of so many lines; a ValueError where there are fewer."""
+    rows = list(islice(_cells(lines, separator), count))
+    if len(rows) < count:
+        raise ValueError(
+            f"{path}: the head has {count} lines, this file {len(rows)} in all."
+        )
+    return [[cell.strip() for cell in cells] for _, cells in rows]
 
 
 def _in_threes(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
@@ -174,18 +213,19 @@ def _check_once(path: Path, names: Sequence[str]) -> None:
         raise ValueError(f"{path}: the file {what}.")
 
 
-def _qualisys(path: Path, text: str) -> Capture:
+def _qualisys(path: Path, lines: Lines) -> Capture:
     """Qualisys TSV: rows KEY value, perhaps a row of names of columns; a lost marker is
     0, 0, 0.
     """
-    lines = [line.split("\t") for line in text.splitlines()]
     head: dict[str, list[str]] = {}
-    first = len(lines)
-    for k, cells in enumerate(lines):
+    rows = _cells(lines, "\t")
+    for row in rows:
+        _, cells = row
         key = cells[0].strip()
         if _is_number(key) or key.lower() in ("frame", "time") or (head and not key):
-            first = k
-            break
+            if any(_is_number(cell) for cell in cells):
+                rows = chain([row], rows)
+            break  # else the row has names of columns
         _, *words = cells
         head[key] = [word.strip() for word in words]
     included = (head.get("DATA_INCLUDED") or ["3D"])[0]
@@ -196,20 +236,15 @@ def _qualisys(path: Path, text: str) -> Capture:
         )
     names = [name for name in head["MARKER_NAMES"] if name]
     _check_once(path, names)
-    body = [
-        (k + 1, cells) for k, cells in enumerate(lines) if k >= first and any(cells)
-    ]
-    if body:
-        (_, cells), *below = body
-        if not any(_is_number(cell) for cell in cells):
-            body = below  # the first row has names of columns
-    widest = max((len(cells) - (not cells[-1].strip()) for _, cells in body), default=0)
+    first = next((row for row in rows if any(row[1])), (0, [""]))
+    _, cells = first
+    widest = len(cells) - (not cells[-1].strip())
     before = max(widest - 3 * len(names), 0)  # frame, time
     if before > 2:
         raise ValueError(
             f"{path}: lines have {before} cells more than {len(names)} markers need."
         )
-    values = _rows(path, body, before + 3 * len(names))
+    values = _rows(path, chain([first], rows), before + 3 * len(names)).values
     places = values[:, before:].reshape(len(values), len(names), 3)
     lost = (places == 0).all(axis=2)
     places = np.where(lost[:, :, None], np.nan, places)
@@ -240,33 +275,20 @@ def _without_head(values: np.ndarray) -> np.ndarray:
     return values[:, HEAD:]
 
 
-def _rounding_of_times(body: list[tuple[int, list[str]]]) -> float:
-    """The last digit [s] of times, the second cells of numbered rows."""
-    digits = [len(time.strip().partition(".")[-1]) for _, (_, time, *_) in body]
-    return 10.0 ** -max(digits)
-
-
-def _trc(path: Path, text: str) -> Capture:
+def _trc(path: Path, lines: Lines) -> Capture:
     """TRC: keys and values in two rows, names above X1 Y1 Z1; a lost marker is
     empty.
     """
-    lines = text.splitlines()
-    if len(lines) < 5:
-        raise ValueError(
-            f"{path}: a TRC file has five lines of head, this one {len(lines)} in all."
-        )
-    cells = [[x.strip() for x in line.split("\t")] for line in lines]
-    _, keys, words, of_markers, _, *rows = cells
+    _, keys, words, of_markers, _ = _head(path, lines, "\t", 5)
     head = dict(zip(keys, words))
     names = [x for x in of_markers[HEAD:] if x]
     _check_once(path, names)
-    body = [(k, row) for k, row in enumerate(rows, 6) if any(row)]
-    values = _rows(path, body, HEAD + 3 * len(names))
-    frames, times, *_ = values.T
-    found = _in_threes(names, _without_head(values))
+    rows = _rows(path, _cells(lines, "\t"), HEAD + 3 * len(names))
+    frames, times, *_ = rows.values.T
+    found = _in_threes(names, _without_head(rows.values))
     unit = _unit(path, "Units", head.get("Units", ""))
     rate = _stated(path, "DataRate", head.get("DataRate", ""))
-    t = _times(path, frames, times, rate, _rounding_of_times(body))
+    t = _times(path, frames, times, rate, rows.digit)
     return Capture("TRC", dict.fromkeys(names, PLACE), found, unit, rate, t)
 
 
@@ -305,15 +327,16 @@ def _times(
     return t
 
 
-def _optitrack(path: Path, text: str) -> Capture:
+def _optitrack(path: Path, lines: Lines) -> Capture:
     """CSV of OptiTrack Motive: a row of keys and values, rows of names; lost is
     empty.
     """
-    lines = [line.split(",") for line in text.splitlines()]
-    first = [x.strip().strip('"') for x in lines[0]]
+    rows = _cells(lines, ",")
+    _, first = next(rows)
+    first = [x.strip().strip('"') for x in first]
     keys = first[::2]
     head = dict(zip(keys, first[1::2]))
-    start, names, kinds, axes = _heads_of_optitrack(path, lines)
+    names, kinds, axes = _heads_of_optitrack(path, rows)
     places: dict[str, dict[str, int]] = {}
     for k in range(2, len(axes)):
         if k < len(kinds):
@@ -330,12 +353,8 @@ def _optitrack(path: Path, text: str) -> Capture:
         places = {
             x: {a: k for a, k in of.items() if a in PLACE} for x, of in places.items()
         }
-    body = [
-        (k + 1, x)
-        for k, x in enumerate(lines)
-        if k > start and any(c.strip() for c in x)
-    ]
-    values = _rows(path, body, len(axes))
+    body = _rows(path, rows, len(axes))
+    values = body.values
     order = {
         x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()
     }
@@ -347,21 +366,20 @@ def _optitrack(path: Path, text: str) -> Capture:
     )
     unit = _unit(path, "Length Units", head.get("Length Units", ""))
     frames, times, *_ = values.T
-    t = _times(path, frames, times, rate, _rounding_of_times(body))
+    t = _times(path, frames, times, rate, body.digit)
     return Capture("OptiTrack CSV", order, found, unit, rate, t)
 
 
 def _heads_of_optitrack(
-    path: Path, lines: list[list[str]]
-) -> tuple[int, list[str], list[str], list[str]]:
-    """Number of the row Frame, and the rows of names, of Position or Rotation, and of
-    axes.
+    path: Path, rows: Iterable[tuple[int, list[str]]]
+) -> tuple[list[str], list[str], list[str]]:
+    """The rows of names, of Position or Rotation, and of axes, which is the row Frame
+    and the last one of the head.
 
     Rows are Type, Name, ID, perhaps Parent; older files leave these words out.
     """
     found: list[list[str]] = []
-    _, *rows = lines
-    for k, cells in enumerate(rows, 1):
+    for _, cells in rows:
         row = [x.strip().strip('"') for x in cells]
         if row[0] == "Frame":
             kinds = [x for x in found if {"Position", "Rotation"} & set(x)]
@@ -369,7 +387,7 @@ def _heads_of_optitrack(
             labelled = [x for x in found if x[1] == "Name"]
             names = labelled or found[1:]
             if kinds and names:
-                return k, names[0], kinds[-1], row
+                return names[0], kinds[-1], row
         if any(row) and len(row) > 1:
             found.append(row)
     raise ValueError(
@@ -377,14 +395,11 @@ def _heads_of_optitrack(
     )
 
 
-def _vicon(path: Path, text: str) -> Capture:
+def _vicon(path: Path, lines: Lines) -> Capture:
     """CSV of Vicon Nexus: its part Trajectories, to the next empty line; lost is
     empty.
     """
-    lines = [[x.strip() for x in line.split(",")] for line in text.splitlines()]
-    if len(lines) < 5:
-        raise ValueError(f"{path}: the part Trajectories has a head of five lines.")
-    _, (rate_in_words, *_), of_markers, _, of_units, *rows = lines
+    _, (rate_in_words, *_), of_markers, _, of_units = _head(path, lines, ",", 5)
     rate = _stated(path, "the rate in line 2", rate_in_words)
     names = [x for x in of_markers if x]
     _check_once(path, names)
@@ -393,12 +408,10 @@ def _vicon(path: Path, text: str) -> Capture:
         raise ValueError(
             f"{path}, line 5: all units must be the same, but are {sorted(units)}."
         )
-    body = []
-    for k, cells in enumerate(rows, 6):
-        if not any(cells):
-            break
-        body.append((k, cells))
-    values = _rows(path, body, HEAD + 3 * len(names))
+    part = takewhile(
+        lambda row: any(cell.strip() for cell in row[1]), _cells(lines, ",")
+    )
+    values = _rows(path, part, HEAD + 3 * len(names)).values
     found = _in_threes(names, _without_head(values))
     frames = values[:, 0]
     if rate is None:

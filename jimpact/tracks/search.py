@@ -271,7 +271,7 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     """
     verdict = search.verdict
     contact = search.settings.contact
-    flight = verdict.flight.without_common(verdict.bent.all(axis=0))
+    flight = verdict.flight.without_common(np.all(verdict.bent, axis=0))
     start = Start(verdict.flights, flight, verdict.errors, verdict.bent, contact)
     moving = False
     while True:
@@ -314,7 +314,7 @@ def with_likely_errors(search: Search, start: Start) -> Start:
     errors, flight, bent = likely_errors(
         straight, start.flights, start.flight, search.settings.estimated, speeds
     )
-    flight = flight.without_common(bent.all(axis=0))
+    flight = flight.without_common(np.all(bent, axis=0))
     return replace(start, errors=errors, flight=flight, bent=bent)
 
 

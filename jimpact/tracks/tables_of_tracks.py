@@ -4,8 +4,10 @@ them.
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,7 @@ FRAMES = {
 FRAMES |= {"frameid", "framenum"}
 # bytes of a file; ten times more would not go into most memories
 LARGEST = 2_000_000_000
+MOST_LISTED = 10  # values of a column that an error lists
 # steps dt differ by less than that share of themselves; times of frames do not
 ALIKE = 0.5
 Name = str | int
@@ -260,9 +263,7 @@ class _Table:
 def _table(
     path: str | Path, names: Sequence[Name], rows: _Rows, decimal: str
 ) -> _Table:
-    """The columns of a table of text."""
-    text = Path(path).read_bytes().decode("utf-8-sig", errors="replace")
-    lines = text.splitlines()
+    """The columns of a table of text, which is read line by line."""
     of_rows = [x for x in (rows.time, rows.frame) if x is not None]
     wanted = [*names, *of_rows, *(rows.where or {})]
     numbered = [isinstance(name, int) for name in wanted]
@@ -271,63 +272,172 @@ def _table(
             f"Columns must all be names, or all numbers, but are "
             f"{', '.join(map(repr, wanted))}."
         )
-    if all(numbered):
-        start, separator = _without_names(path, lines, wanted, decimal)
-        header: list[str] = []
-        places = [int(name) for name in wanted]
-    else:
-        start, separator, header = _header(
-            path, lines, [str(x) for x in wanted], decimal
-        )
-        places = [_place(path, header, str(name)) for name in wanted]
-    body = [
-        (k, _cells(line, separator)) for k, line in enumerate(lines, 1) if k > start
-    ]
-    body = [(k, cells) for k, cells in body if any(cell.strip() for cell in cells)]
-    if body and not any(char.isdigit() for cell in body[0][1] for char in cell):
-        body = body[1:]  # a line of units
-    if rows.where:
-        body = _chosen(
-            path, body, dict(zip(rows.where, places[-len(rows.where) :])), rows.where
-        )
-    if not body:
+    with Path(path).open(encoding="utf-8-sig", errors="replace") as file:
+        first = [line.rstrip("\n") for line in islice(file, HEADER_LINES)]
+        if all(numbered):
+            start, separator = _without_names(path, first, wanted, decimal)
+            header: list[str] = []
+            places = [int(name) for name in wanted]
+        else:
+            start, separator, header = _header(
+                path, first, [str(x) for x in wanted], decimal
+            )
+            places = [_place(path, header, str(name)) for name in wanted]
+        count = len(names) + len(of_rows)
+        columns = _Columns(path, places[:count], [str(x) for x in wanted], decimal)
+        choice = _Choice.of(rows.where or {}, places[count:])
+        frames = _frames_beside(header)
+        if rows.frame is not None:
+            frames = []
+        for k, cells in _body(chain(first[start:], file), start + 1, separator):
+            if choice.takes(cells):
+                columns.add(k, cells)
+                frames = [some for some in frames if some.takes(cells)]
+    values = columns.values()
+    if not len(values):
+        choice.raise_for_none(path)
         raise ValueError(
             f"{path}: there are no lines of numbers below the names of the columns."
         )
-    count = len(names) + len(of_rows)
-    labels = [str(x) for x in wanted[:count]]
-    values = np.array(
-        [_numbers(path, k, x, places[:count], labels, decimal) for k, x in body]
-    )
+    order = None
     if of_rows:
         order = values[:, -1]
-    else:
-        order = None
-    if rows.frame is not None:
-        beside = None
-    else:
-        beside = _frames_beside(header, body)
+    beside = None
+    if frames:
+        beside = (frames[0].name, np.array(frames[0].numbers))
     return _Table(values[:, : len(names)], order, beside)
 
 
-def _chosen(
-    path: str | Path,
-    body: list[tuple[int, list[str]]],
-    places: Mapping[Name, int],
-    where: Mapping[Name, Any],
-) -> list[tuple[int, list[str]]]:
-    """The rows whose cells hold what `where` says; a ValueError where none does."""
-    for name, value in where.items():
-        place = places[name]
-        there = [cells[place] if place < len(cells) else "" for _, cells in body]
-        found = [row for row, cell in zip(body, there) if _same(cell, value)]
-        if not found:
-            listed = ", ".join(sorted(set(there))[:10])
-            raise ValueError(
-                f"{path}: no row has {value!r} in column `{name}`, but {listed}."
-            )
-        body = found
-    return body
+def _body(
+    lines: Iterable[str], start: int, separator: str | None
+) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of each line that is not empty; a first line without digits is
+    one of units, and left out.
+    """
+    first = True
+    for k, line in enumerate(lines, start):
+        cells = _cells(line, separator)
+        if not any(cells):
+            continue
+        units = first and not any(char.isdigit() for char in line)
+        first = False
+        if not units:
+            yield k, cells
+
+
+@dataclass
+class _Choice:
+    """Rows whose cells hold what `where` says: names of columns, their places and
+    values, how many rows pass each, and some cells that did not.
+    """
+
+    names: list[Name]
+    places: list[int]
+    values: list[Any]
+    passed: list[int]
+    others: list[set[str]]
+
+    @classmethod
+    def of(cls, where: Mapping[Name, Any], places: list[int]) -> "_Choice":
+        """The choice before the first row."""
+        names = list(where)
+        return cls(
+            names,
+            places,
+            list(where.values()),
+            [0] * len(names),
+            [set() for _ in names],
+        )
+
+    def takes(self, cells: list[str]) -> bool:
+        """True for a row that holds all values."""
+        for k, place in enumerate(self.places):
+            cell = _cell(cells, place)
+            if not _same(cell, self.values[k]):
+                if len(self.others[k]) < MOST_LISTED:
+                    self.others[k].add(cell)
+                return False
+            self.passed[k] += 1
+        return True
+
+    def raise_for_none(self, path: str | Path) -> None:
+        """Raise a ValueError for the first column whose value no row has."""
+        for k, name in enumerate(self.names):
+            if not self.passed[k] and self.others[k]:
+                listed = ", ".join(sorted(self.others[k]))
+                raise ValueError(
+                    f"{path}: no row has {self.values[k]!r} in column `{name}`, but "
+                    f"{listed}."
+                )
+
+
+@dataclass
+class _Columns:
+    """Numbers of the columns at `places`, with these names, of one row after the
+    other.
+    """
+
+    path: str | Path
+    places: list[int]
+    names: list[str]
+    decimal: str
+    numbers: array = field(default_factory=lambda: array("d"))
+
+    def add(self, line: int, cells: list[str]) -> None:
+        """Add the numbers of a line; NaN where a cell is empty or the line shorter."""
+        for place, name in zip(self.places, self.names):
+            cell = _cell(cells, place)
+            if cell.lower() in _MISSING:
+                self.numbers.append(np.nan)
+                continue
+            if self.decimal == ".":
+                other = ","
+            else:
+                other = "."
+            if other in cell or not _is_number(cell, self.decimal):
+                raise ValueError(
+                    f"{self.path}, line {line}, column `{name}`: {cell!r} must be a "
+                    f"number with the decimal mark {self.decimal!r} (argument "
+                    f"`decimal`)."
+                )
+            self.numbers.append(float(cell.replace(self.decimal, ".")))
+
+    def values(self) -> np.ndarray:
+        """The numbers (T, n)."""
+        return np.array(self.numbers).reshape(-1, len(self.places))
+
+
+@dataclass
+class _FrameNumbers:
+    """A column of frame numbers that was not asked for."""
+
+    name: str
+    place: int
+    numbers: array = field(default_factory=lambda: array("d"))
+
+    def takes(self, cells: list[str]) -> bool:
+        """Add the number of a row; False where its cell is no whole number."""
+        cell = _cell(cells, self.place)
+        if not re.fullmatch(r"-?\d+(\.0*)?", cell):
+            return False
+        self.numbers.append(float(cell))
+        return True
+
+
+def _frames_beside(header: Sequence[str]) -> list[_FrameNumbers]:
+    """Columns whose name is that of frame numbers."""
+    return [
+        _FrameNumbers(name, place)
+        for place, name in enumerate(header)
+        if re.sub(r"[^a-z]", "", name.lower()) in FRAMES
+    ]
+
+
+def _cell(cells: Sequence[str], place: int) -> str:
+    """The cell at a place, empty where the line is shorter."""
+    if place < len(cells):
+        return cells[place]
+    return ""
 
 
 def _same(cell: str, value: Any) -> bool:
@@ -338,21 +448,6 @@ def _same(cell: str, value: Any) -> bool:
         return float(cell) == float(value)
     except (TypeError, ValueError):
         return False
-
-
-def _frames_beside(
-    header: Sequence[str], body: Sequence[tuple[int, list[str]]]
-) -> tuple[str, np.ndarray] | None:
-    """Name and numbers of a column of frame numbers that was not asked for; None
-    without.
-    """
-    for place, name in enumerate(header):
-        if re.sub(r"[^a-z]", "", name.lower()) not in FRAMES:
-            continue
-        cells = [row[place] if place < len(row) else "" for _, row in body]
-        if all(re.fullmatch(r"-?\d+(\.0*)?", cell) for cell in cells):
-            return name, np.array(cells, float)
-    return None
 
 
 def _times(
@@ -558,36 +653,3 @@ def _is_number(cell: str, decimal: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _numbers(
-    path: str | Path,
-    line: int,
-    cells: list[str],
-    places: list[int],
-    names: list[str],
-    decimal: str,
-) -> list[float]:
-    """Numbers of a line in the columns `places`; NaN where a cell is empty or the line
-    shorter.
-    """
-    values = []
-    for place, name in zip(places, names):
-        if place < len(cells):
-            cell = cells[place]
-        else:
-            cell = ""
-        if cell.lower() in _MISSING:
-            values.append(np.nan)
-            continue
-        if decimal == ".":
-            other = ","
-        else:
-            other = "."
-        if other in cell or not _is_number(cell, decimal):
-            raise ValueError(
-                f"{path}, line {line}, column `{name}`: {cell!r} must be a number with "
-                f"the decimal mark {decimal!r} (argument `decimal`)."
-            )
-        values.append(float(cell.replace(decimal, ".")))
-    return values
