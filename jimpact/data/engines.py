@@ -77,7 +77,8 @@ class EngineImpacts(Tabular):
         columns += [Column("second_distance", ".3f", "its distance")]
         cells = []
         for row in self.rows:
-            v = [*row.velocity, *[None] * (5 - len(row.velocity))]
+            missing = [None] * (5 - len(row.velocity))
+            v = [*row.velocity, *missing]
             cells.append([*row[:4], *v, *row[5:]])
         notes = [
             "Measured with the versions in the table; v in units of v1-. "
@@ -113,9 +114,8 @@ def engine_impacts(
     >>> row.velocity, row.energy_ratio
     ((-0.174, 0.349, 0.826), 0.834)
     """
-    with (files("jimpact") / "data" / "engine_impacts.csv").open(
-        encoding="utf-8"
-    ) as file:
+    path = files("jimpact") / "data" / "engine_impacts.csv"
+    with path.open(encoding="utf-8") as file:
         every = [_row(line) for line in csv.DictReader(file)]
     for name, value in (("engine", engine), ("scene", scene)):
         known = list(dict.fromkeys(getattr(row, name) for row in every))

@@ -51,14 +51,15 @@ def ellipse_impacts() -> Experiments:
     cosine = np.cos(values["q"][:, 2])
     height = np.hypot(a * sine, b * cosine)  # h
     arm = (b**2 - a**2) * sine * cosine / height  # c
-    mass = ELLIPSE_MASS * np.array([1.0, 1.0, (a**2 + b**2) / 4])
+    radius_squared = (a**2 + b**2) / 4  # of gyration
+    mass = ELLIPSE_MASS * np.array([1.0, 1.0, radius_squared])
     scenes = [
         Scene(mass, [[0.0], [1.0], [x]], tangents=[[1.0], [0.0], [h]])
         for x, h in zip(arm, height)
     ]
-    return Experiments(
-        values["pre"], values["post"], scenes=scenes, shots=labels, units=units
-    )
+    pre = values["pre"]
+    post = values["post"]
+    return Experiments(pre, post, scenes=scenes, shots=labels, units=units)
 
 
 def square_impacts(near: float = 2e-3) -> Experiments:
@@ -107,7 +108,8 @@ def square_drops() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     with np.load(str(_DATA / "square_drops.npz")) as stored:
         steps = stored["steps"]
         drops = stored["drop"]
-    q = np.cumsum(steps, axis=1, dtype=np.int32) * np.array(POSE_UNITS)
+    counts = np.cumsum(steps, axis=1, dtype=np.int32)
+    q = counts * np.array(POSE_UNITS)
     return drops, np.arange(q.shape[1]) / 250.0, q
 
 
@@ -146,16 +148,16 @@ def cube_impacts(
     >>> two.pre.shape, two.scenes[0].contacts, two.units[5]
     ((21, 6), 2, 'rad/s')
     """
-    table = tomllib.loads((_DATA / "tossed_cube.toml").read_text(encoding="utf-8"))[
-        "scene"
-    ]
+    text = (_DATA / "tossed_cube.toml").read_text(encoding="utf-8")
+    table = tomllib.loads(text)["scene"]
     names = ("sizes_m", "mass_kg", "inertia_kg_m2", "centre_m", "rounding_m")
     cube = Box(*(table[name] for name in names))
     sources = (
         "cube_impacts.csv",
         *(("cube_nearly_clean.csv",) if nearly_clean else ()),
     )
-    parts = [read_experiments(str(_DATA / name), cube, near) for name in sources]
+    paths = (str(_DATA / name) for name in sources)
+    parts = [read_experiments(path, cube, near) for path in paths]
     if nearly_clean:
         shots = Experiments.join(parts)
     else:

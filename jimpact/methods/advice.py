@@ -101,7 +101,8 @@ class Situation(NamedTuple):
     @property
     def coupled(self) -> tuple[ContactBlock, ...]:
         """Blocks of two contacts and more in which one approaches."""
-        return tuple(b for b in self.blocks if b.approaches and len(b.contacts) > 1)
+        approaching = (block for block in self.blocks if block.approaches)
+        return tuple(block for block in approaching if len(block.contacts) > 1)
 
 
 class Trial(NamedTuple):
@@ -121,7 +122,8 @@ class Trial(NamedTuple):
         """
         rows, contacts = stiffness.shape
         if "stiffness" not in free_parameters_of(self.law):
-            return {"velocity": velocity[None, :]}, max(1, LANES // contacts**2)
+            lanes = max(1, LANES // contacts**2)
+            return {"velocity": velocity[None, :]}, lanes
         return {"stiffness": stiffness}, CHUNK if contacts <= FEW_CONTACTS else min(
             rows, CHUNK
         )
@@ -133,7 +135,8 @@ class Trial(NamedTuple):
         scene = self.scene
         # scenes with and without gaps share one compiled program
         if scene.gaps is None:
-            scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
+            touching = jnp.zeros(scene.contacts, scene.mass.dtype)
+            scene = with_gaps(scene, touching)
         return varied_impacts(self.law, scene, jnp.asarray(velocity), varied)
 
 
@@ -230,17 +233,18 @@ def advise(
     mixed = len(np.unique(np.asarray(exponent, float))) > 1
     # gaps, and contacts with unequal exponents, have no outcome in ratios of stiffness
     # alone
-    absolute = bool(situation.gapped.any()) or (mixed and bool(situation.coupled))
+    some_gap = bool(situation.gapped.any())
+    absolute = some_gap or (mixed and bool(situation.coupled))
     if absolute and stiffness is None:
         raise ValueError(_missing_stiffness(situation))
-    nominal = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
+    given = np.asarray(k, v.dtype)
+    nominal = np.broadcast_to(given, (scene.contacts,))
     unknown = _unknown_stiffnesses(situation, nominal, factors, absolute)
     tried = _stiffnesses_to_try(nominal, unknown, samples, seed)
     laws = trials(situation, law)
     options = (float(tolerance), timing, progress)
-    return _simplest_law(
-        situation, laws, unknown, tried, slice(-samples, None), *options
-    )
+    random = slice(-samples, None)
+    return _simplest_law(situation, laws, unknown, tried, random, *options)
 
 
 def _simplest_law(
@@ -282,15 +286,14 @@ def _simplest_law(
         costs = _costs(laws, v, k)
     else:
         costs = {}
-    candidates = {
-        key: _candidate(
-            law, situation, outcomes[key], reference, random, costs.get(key)
+    candidates = {}
+    for key, law in laws.items():
+        cost = costs.get(key)
+        candidates[key] = _candidate(
+            law, situation, outcomes[key], reference, random, cost
         )
-        for key, law in laws.items()
-    }
-    suffice = [
-        key for key, c in candidates.items() if c.usable and c.worst <= tolerance
-    ]
+    usable = {key: c for key, c in candidates.items() if c.usable}
+    suffice = [key for key, c in usable.items() if c.worst <= tolerance]
     if suffice:
         chosen = suffice[0]
     else:
@@ -350,7 +353,8 @@ def _checked_range(
 def _missing_stiffness(situation: Situation) -> str:
     """Error message: the absolute stiffness must be given, and why."""
     if situation.gapped.any():
-        named = ", ".join(str(j + 1) for j in np.flatnonzero(situation.gapped))
+        numbers = np.flatnonzero(situation.gapped)
+        named = ", ".join(str(j + 1) for j in numbers)
         return (
             f"Argument `stiffness` must be given [N/m^eta] where open contacts can "
             f"close while others are loaded (contact {named}): gaps count in units of "
@@ -378,17 +382,22 @@ def situation_of(
     far = opened & ~_can_close(scene, velocity, law, known)
     if far.any():
         assert scene.gaps is not None
-        scene = with_gaps(scene, jnp.where(jnp.asarray(far), jnp.inf, scene.gaps))
-    blocks = blocks_of(scene, gamma, np.flatnonzero(~far), law.friction is not None)
+        removed = jnp.asarray(far)
+        scene = with_gaps(scene, jnp.where(removed, jnp.inf, scene.gaps))
+    near = np.flatnonzero(~far)
+    rubs = law.friction is not None
+    blocks = blocks_of(scene, gamma, near, rubs)
     # in a block that approaches; and open
     acting, gapped = np.zeros((2, len(gamma)), bool)
     for block in blocks:
         contacts = list(block.contacts)
         acting[contacts] = block.approaches
-        gapped[contacts] = opened[contacts] & block.approaches & (len(contacts) > 1)
+        counts = block.approaches & (len(contacts) > 1)
+        gapped[contacts] = opened[contacts] & counts
     touching = scene
     if scene.gaps is not None:
-        gaps = jnp.where(jnp.asarray(acting), 0.0, scene.gaps).astype(scene.gaps.dtype)
+        without = jnp.where(jnp.asarray(acting), 0.0, scene.gaps)
+        gaps = without.astype(scene.gaps.dtype)
         touching = with_gaps(scene, gaps)
     v = np.asarray(velocity)
     norm = EnergyNorm.of(scene, v)
@@ -407,14 +416,14 @@ def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.
     mass = dense_mass(scene)
     normals = np.asarray(scene.normals)
     # W_jj
-    diagonal = np.sum(normals * np.asarray(solve_mass(scene, scene.normals)), axis=0)
+    moved = np.asarray(solve_mass(scene, scene.normals))
+    diagonal = np.sum(normals * moved, axis=0)
     fastest = np.sqrt(diagonal * (velocity @ mass @ velocity))
     duration = LONGEST_CONTACT
     approach = float(-np.min(normals.T @ velocity))
     if known and approach > 0:
-        delta = np.asarray(gap_scale(scene, law, velocity).delta)[
-            np.asarray(scene.closed)
-        ]
+        scale = gap_scale(scene, law, velocity)
+        delta = np.asarray(scale.delta)[np.asarray(scene.closed)]
         duration = CONTACT_TIMES * float(delta.max(initial=0.0)) / approach
     return np.asarray(scene.gaps) <= fastest * duration
 
@@ -437,15 +446,15 @@ def blocks_of(
     for each in np.unique(label):
         members = np.flatnonzero(label == each)
         inside = np.ix_(contacts[members], contacts[members])
-        angles = angle[inside][np.triu(coupled[np.ix_(members, members)], 1)]
+        pairs = np.triu(coupled[np.ix_(members, members)], 1)
+        angles = angle[inside][pairs]
         if angles.size:
             ends = (float(angles.min()), float(angles.max()))
         else:
             ends = None
         joined = contacts[members]
-        blocks.append(
-            ContactBlock(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends)
-        )
+        approaches = bool((gamma[joined] < 0).any())
+        blocks.append(ContactBlock(tuple(joined.tolist()), approaches, ends))
     return tuple(blocks)
 
 
@@ -463,11 +472,12 @@ def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
     size = np.sqrt(np.diag(w))
     m = scene.contacts
     # the contact of each column
-    contact = np.concatenate([np.arange(m), np.repeat(np.arange(m), (len(w) - m) // m)])
+    tangents = (len(w) - m) // m
+    contact = np.concatenate([np.arange(m), np.repeat(np.arange(m), tangents)])
     largest = np.zeros((m, m))
-    np.maximum.at(
-        largest, (contact[:, None], contact[None, :]), np.abs(w / np.outer(size, size))
-    )
+    pairs = (contact[:, None], contact[None, :])
+    cosines = np.abs(w / np.outer(size, size))
+    np.maximum.at(largest, pairs, cosines)
     return largest
 
 
@@ -514,18 +524,21 @@ def _stiffnesses_to_try(
         return stiffness[None, :]
     low = np.log([u.low / u.nominal for u in unknown])
     high = np.log([u.high / u.nominal for u in unknown])
-    places = np.concatenate(
-        [low + np.outer(ALONE, high - low), [[NUDGE] * count, [-NUDGE] * count]]
-    )
+    alone = low + np.outer(ALONE, high - low)
+    nudged = [[NUDGE] * count, [-NUDGE] * count]
+    places = np.concatenate([alone, nudged])
     # axes: the unknown that changes, its place, change of ln k of every unknown
-    single = places.T[:, :, None] * np.eye(count)[:, None, :]
+    of_unknown = np.eye(count)[:, None, :]
+    single = places.T[:, :, None] * of_unknown
     if 2**count <= CORNERS:
-        ends = np.array(list(itertools.product((0.0, 1.0), repeat=count)))
+        corners = itertools.product((0.0, 1.0), repeat=count)
+        ends = np.array(list(corners))
     else:
         ends = random.integers(0, 2, (CORNERS, count)).astype(float)
     drawn = random.uniform(0.0, 1.0, (samples, count))
     spread = low + np.concatenate([ends, drawn]) * (high - low)
-    change = np.concatenate([np.zeros((1, count)), single.reshape(-1, count), spread])
+    nominal = np.zeros((1, count))
+    change = np.concatenate([nominal, single.reshape(-1, count), spread])
     tried = np.tile(stiffness, (len(change), 1))
     for i, u in enumerate(unknown):
         tried[:, u.contact] *= np.exp(change[:, i])
@@ -541,15 +554,14 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     """
     v = situation.velocity
     m = situation.scene.contacts
-    e, k = (
-        jnp.broadcast_to(x, (m,)).astype(v.dtype)
-        for x in (law.restitution, law.stiffness)
-    )
+    e = jnp.broadcast_to(law.restitution, (m,)).astype(v.dtype)
+    k = jnp.broadcast_to(law.stiffness, (m,)).astype(v.dtype)
     mu = law.friction
     touching = situation.touching
     kappa = law.tangential_stiffness
     gapped = bool(situation.gapped.any())
-    known = dict(zip(ADVISED, (e, k, law.exponent, mu, kappa), strict=True))
+    values = (e, k, law.exponent, mu, kappa)
+    known = dict(zip(ADVISED, values, strict=True))
     laws, _ = registered_laws(known, simplest_first())
     laws["binary"] = Binary(e, "earliest" if gapped else "fastest", friction=mu)
     bistiffness = Bistiffness(k, law.exponent, e)
@@ -591,10 +603,10 @@ def _costs(
         full = {name: np.resize(x, (batch, *x.shape[1:])) for name, x in varied.items()}
         runs.append(partial(trial.run, velocity, jax.device_put(full)))
         counts.append(batch)
-    each = [
-        np.median(times) / count for times, count in zip(in_turns(runs, ROUNDS), counts)
-    ]
-    return {name: float(x / min(each)) for name, x in zip(laws, each)}
+    timed = zip(in_turns(runs, ROUNDS), counts)
+    medians = [np.median(times) / count for times, count in timed]
+    cheapest = min(medians)
+    return {name: float(x / cheapest) for name, x in zip(laws, medians)}
 
 
 # -------------------------------------------------------------------------- the
@@ -612,7 +624,8 @@ def _reclosing_distance(situation: Situation, outcomes: dict[str, Outcomes]) -> 
     usable = ~(lzb.failed | compliant.failed)
     if situation.gapped.any() or not usable.any():
         return 0.0
-    return float(situation.distance((lzb.velocity - compliant.velocity)[usable]).max())
+    change = (lzb.velocity - compliant.velocity)[usable]
+    return float(situation.distance(change).max())
 
 
 def _candidate(
@@ -651,12 +664,14 @@ def _with_coarsest_rtol(
     It changes v+ by less than `tolerance / SMALL_PART` in the energy norm over that of
     v-.
     """
-    rtol = min(10.0 ** math.floor(math.log10(tolerance / SMALL_PART)), COARSEST_RTOL)
+    power = math.floor(math.log10(tolerance / SMALL_PART))
+    rtol = min(10.0**power, COARSEST_RTOL)
     finest = default_rtol("time", situation.velocity.dtype)
     while True:
         rtol = max(rtol, finest)
         law: Any = replace(candidate.law, rtol=rtol)  # type: ignore[call-arg]
-        v = np.asarray(impact(law, candidate.scene, situation.velocity).velocity)
+        out = impact(law, candidate.scene, situation.velocity)
+        v = np.asarray(out.velocity)
         change = float(situation.distance(v - candidate.velocity))
         if rtol == finest or change <= tolerance / SMALL_PART:
             error = float(situation.distance(v - reference.velocity[0]))
@@ -689,7 +704,8 @@ def _with_simplest_laws(
             if t := reference.tangential.shape[1]:
                 of_block = np.repeat(inside, t // m)  # mask (t,) of tangents
                 dp_t = (out.tangential[:1] - reference.tangential) * of_block
-            dv = changes((out.impulse[:1] - reference.impulse) * inside, dp_t)
+            dp = (out.impulse[:1] - reference.impulse) * inside
+            dv = changes(dp, dp_t)
             within = np.nanmax(situation.distance(np.asarray(dv))) <= tolerance
             if within and candidates[name].status != "order_dependent":
                 block = block._replace(law=name)
@@ -715,9 +731,8 @@ def _with_effects(
     for i, u in enumerate(unknown):
         v = reference.velocity[1 + i * places :][:places]
         *_, up, down = v  # ln k changed by +- NUDGE
-        alone = float(
-            np.nanmax(situation.distance(v[: len(ALONE)] - reference.velocity[0]))
-        )
+        change = v[: len(ALONE)] - reference.velocity[0]
+        alone = float(np.nanmax(situation.distance(change)))
         slope = float(situation.distance(up - down)) / (2 * NUDGE)
         if slope > 0:
             needed = tolerance / slope

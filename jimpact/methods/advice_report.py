@@ -150,7 +150,8 @@ class Advice(Tabular):
     @property
     def reason(self) -> str:
         """Sentence: why this law is advised, and the error of the best simpler law."""
-        return "; ".join(filter(None, (_cause(self), _closest_simpler(self))))
+        phrases = (_cause(self), _closest_simpler(self))
+        return "; ".join(filter(None, phrases))
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it; contacts counted from 1."""
@@ -202,9 +203,8 @@ class Advice(Tabular):
             f"v-), dv the difference of v+; stiffnesses tried: {self.rows}."
         )
         notes = ["", *textwrap.wrap(footnote, _WIDTH)]
-        if not self.unknown and any(
-            b.approaches and len(b.contacts) > 1 for b in self.blocks
-        ):
+        clusters = (b for b in self.blocks if b.approaches and len(b.contacts) > 1)
+        if not self.unknown and any(clusters):
             notes += textwrap.wrap(_KNOWN, _WIDTH)
         notes += left_out_notes(self.left_out)
         return Table(columns, rows, [*head, ""], notes)
@@ -341,9 +341,7 @@ def _cause(advice: Advice) -> str:
             f"contacts open and close again, where lzb and compliant are up to "
             f"{apart} apart"
         )
-    if advice.name == "newton" and not np.any(
-        parameters_of(advice.law)["restitution"].value
-    ):
+    if advice.name == "newton" and _is_plastic(advice.law):
         return "plastic contacts (restitution 0) that stay together"
     if advice.name == advice.reference and not advice.unknown:
         return (
@@ -355,6 +353,12 @@ def _cause(advice: Advice) -> str:
         f"{stiffnesses}: {advice.name} is within "
         f"{share(advice.candidates[advice.name].worst)}"
     )
+
+
+def _is_plastic(law: Law) -> bool:
+    """True of a law whose `restitution` is 0 at all contacts."""
+    e = parameters_of(law)["restitution"].value
+    return not np.any(e)
 
 
 def _stiffnesses(advice: Advice, at_work: list[ContactBlock]) -> str:
@@ -378,9 +382,8 @@ def _closest_simpler(advice: Advice) -> str:
     none.
     """
     names = list(advice.candidates)
-    simpler = {
-        name: advice.candidates[name] for name in names[: names.index(advice.name)]
-    }
+    simpler_names = names[: names.index(advice.name)]
+    simpler = {name: advice.candidates[name] for name in simpler_names}
     if not simpler or not any(block.approaches for block in advice.blocks):
         return ""
     best = min(

@@ -1,5 +1,6 @@
 """Speed against accuracy: every way to compute an impact, on one chart."""
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -146,32 +147,21 @@ class WorkPrecision(Tabular):
             Column("status"),
         )
         rows = []
-        differentiated = any(
-            x.gradient for points in self.points.values() for x in points
-        )
+        every = itertools.chain.from_iterable(self.points.values())
+        differentiated = any(x.gradient for x in every)
         for name, points in self.points.items():
             # said once
-            compiled = sum(self.compile_time.get(name, {}).values()) or None
+            seconds = self.compile_time.get(name, {}).values()
+            compiled = sum(seconds) or None
             for x in points:
                 errors = [x.error.get(q, np.nan) for q in QUANTITIES]
-                times = [x.single.median, *x.batched, x.gradient and x.gradient.median]
-                rows.append(
-                    [
-                        name,
-                        x.setting,
-                        *errors,
-                        x.evaluations,
-                        *times,
-                        compiled,
-                        x.status,
-                    ]
-                )
+                gradient = x.gradient and x.gradient.median
+                times = [x.single.median, *x.batched, gradient]
+                before = [name, x.setting, *errors, x.evaluations]
+                rows.append([*before, *times, compiled, x.status])
                 compiled = None
-        uncertain = ", ".join(
-            f"{k} {v:.0e}"
-            for k, v in self.reference.uncertainty.items()
-            if not np.isnan(v)
-        )
+        known = {k: v for k, v in self.reference.uncertainty.items() if not np.isnan(v)}
+        uncertain = ", ".join(f"{k} {v:.0e}" for k, v in known.items())
         notes = [
             f"Reference: {self.reference.how}; uncertain by {uncertain}.",
             f"Errors: relative, the largest of {self.sample} impacts with stiffness "
@@ -264,12 +254,12 @@ def work_precision(
         n: _method_programs(m, case, gradients, durations) for n, m in different.items()
     }
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
-    ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(
-        laws, (None,)
-    )
+    of_methods: dict[str, Any] = {m.name: m.ladder for m in chosen}
+    ladders = of_methods | dict.fromkeys(laws, (None,))
     truth = programs[exact.name].at(FINEST)
     other_truth = programs[second.name].at(SECOND)
-    with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
+    settings_in_all = sum(map(len, ladders.values()))
+    with counting_bar(settings_in_all, "errors", progress) as advance:
         climbed = {
             name: partial(_outcomes_over_ladder, programs[name], name, advance)
             for name in ladders
@@ -280,16 +270,15 @@ def work_precision(
         for n, row in solutions.items()
         for setting, s in zip(ladders[n], row)
     ]
-    times = _times(
-        [(programs[name], setting) for name, setting, _ in rows], repeats, progress
-    )
-    labels = {m.name: m.label or m.name for m in chosen} | {
-        name: f"law: {name}" for name in laws
-    }
+    runs = [(programs[name], setting) for name, setting, _ in rows]
+    times = _times(runs, repeats, progress)
+    labels = {m.name: m.label or m.name for m in chosen}
+    labels |= {name: f"law: {name}" for name in laws}
     points: dict[str, list[Point]] = {name: [] for name in solutions}
     for (name, setting, solution), timings in zip(rows, times):
         off = _errors(case, solution, truth)
-        points[name].append(_point(labels[name], setting, off, solution, timings))
+        point = _point(labels[name], setting, off, solution, timings)
+        points[name].append(point)
     return WorkPrecision(
         velocity=np.asarray(case.velocity),
         points={name: tuple(row) for name, row in points.items()},
@@ -367,8 +356,9 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     m = scene.contacts
     fields = ("stiffness", *shared_parameters(law))
     each = [jnp.broadcast_to(getattr(law, field), (m,)) for field in fields]
-    law = eqx.tree_at(lambda old: [getattr(old, field) for field in fields], law, each)
-    exponents = np.random.default_rng(0).uniform(-0.5, 0.5, (batch, m))
+    law = eqx.tree_at(lambda x: [getattr(x, name) for name in fields], law, each)
+    generator = np.random.default_rng(0)
+    exponents = generator.uniform(-0.5, 0.5, (batch, m))
     exponents[0] = 0.0  # the impact itself
     stiffness = law.stiffness[None, :] * jnp.asarray(SPREAD**exponents)
     return Case(law, scene, v, stiffness, min(SAMPLE, batch))
@@ -387,7 +377,7 @@ def _chosen(
     """
     left_out: dict[str, str] = {}
     if methods is None:
-        reasons = {name: each.supports(case.law) for name, each in CONTENDERS.items()}
+        reasons = {name: m.supports(case.law) for name, m in CONTENDERS.items()}
         left_out = {name: why for name, why in reasons.items() if why is not None}
         methods = [name for name in CONTENDERS if name not in left_out]
     chosen = _supporting("methods", methods, case)
@@ -396,8 +386,10 @@ def _chosen(
         check_choice("settings", name, [each.name for each in chosen])
         ladder = f"settings[{name!r}]"
         check_values(ladder, as_axis(ladder, values), low=0.0, open_low=True)
-    ladders = [np.ravel(settings.get(m.name, m.ladder)).tolist() for m in chosen]
-    return [m._replace(ladder=tuple(x)) for m, x in zip(chosen, ladders)], left_out
+    asked = [settings.get(m.name, m.ladder) for m in chosen]
+    ladders = [np.ravel(x).tolist() for x in asked]
+    with_ladders = [m._replace(ladder=tuple(x)) for m, x in zip(chosen, ladders)]
+    return with_ladders, left_out
 
 
 def _supporting(
@@ -517,9 +509,8 @@ def _method_programs(
             factor = jnp.exp(at["ln k"])
             return timed(k * factor, case._replace(law=law), setting).velocity
 
-        at = {"ln k": jnp.zeros_like(k)} | {
-            name: getattr(case.law, name) for name in names
-        }
+        at = {"ln k": jnp.zeros_like(k)}
+        at |= {name: getattr(case.law, name) for name in names}
         parts = jax.jacfwd(velocity)(at)
         return jnp.concatenate([parts[name] for name in at], axis=-1)
 
@@ -568,7 +559,8 @@ def _compiled(
     def compiled() -> Callable[..., Any]:
         """The compiled program of the arguments and a setting."""
         begin = time.perf_counter()
-        program = jax.jit(function).lower(*arguments, jnp.ones((), float)).compile()
+        traced = jax.jit(function).lower(*arguments, jnp.ones((), float))
+        program = traced.compile()
         compile_time[name] = time.perf_counter() - begin
         return program
 
@@ -642,11 +634,10 @@ def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
     over the longest, Jacobian over `max |v-|`. At rest the largest |v+| and |T+ - T-|
     take their places.
     """
-    fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(truth.velocity).max()
-    before = (
-        float(kinetic_energy(case.scene, case.velocity))
-        or np.abs(truth.energy_change).max()
-    )
+    given = float(jnp.max(jnp.abs(case.velocity)))
+    fastest = given or np.abs(truth.velocity).max()
+    given_energy = float(kinetic_energy(case.scene, case.velocity))
+    before = given_energy or np.abs(truth.energy_change).max()
     compared = {  # value, exact value, scale
         "velocity": (tried.velocity, truth.velocity, fastest),
         "impulse": (tried.impulse, truth.impulse, np.abs(truth.impulse).max()),
@@ -673,9 +664,8 @@ def _point(
     impact.
     """
     status = STATUS[int(np.max(tried.status))].name
-    return Point(
-        label, setting, error, float(np.mean(tried.evaluations)), status, *timings
-    )
+    evaluations = float(np.mean(tried.evaluations))
+    return Point(label, setting, error, evaluations, status, *timings)
 
 
 def _times(
@@ -697,9 +687,8 @@ def _times(
         if run is not None
     ]
     with counting_bar(len(tasks) * repeats, "timings", progress) as advance:
-        times_of_tasks = in_turns(
-            [run for *_, run in tasks], repeats, lambda: advance(1)
-        )
+        runs = [run for *_, run in tasks]
+        times_of_tasks = in_turns(runs, repeats, lambda: advance(1))
     times: list[list[Timing]] = [[] for _ in rows]
     for (row, impacts, _), seconds in zip(tasks, times_of_tasks):
         quartiles = np.quantile(seconds / impacts, (0.5, 0.25, 0.75))

@@ -66,10 +66,8 @@ class Entry:
         out = self.outcome
         checked = {"status": self.status, "consistent": self.audit.consistent}
         rest = fields_as_data(self, "law", "outcome", "audit")
-        return (
-            as_data({"velocity": out.velocity, "impulse": out.impulse, **checked})
-            | rest
-        )
+        moved = {"velocity": out.velocity, "impulse": out.impulse}
+        return as_data(moved | checked) | rest
 
 
 @dataclass(frozen=True)
@@ -210,11 +208,11 @@ def compare(
     check_kind("laws", laws, Mapping)
     # the first calls, with compiling, sort out the laws that raise; then all are timed
     # in turns
-    first, raised = at_points(
-        {n: partial(_first_call, law, scene) for n, law in laws.items()}, v
-    )
+    calls = {name: partial(_first_call, law, scene) for name, law in laws.items()}
+    first, raised = at_points(calls, v)
     runs = {name: partial(impact, laws[name], scene, v) for name in first}
-    each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))
+    measured = in_turns(list(runs.values()), _REPEATS)
+    each = dict(zip(runs, measured))
     times = {name: float(np.median(x)) for name, x in each.items()}
     entries = {
         name: Entry(

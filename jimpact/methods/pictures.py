@@ -3,7 +3,7 @@ advice.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import chain, cycle
 from typing import Any
 
 import numpy as np
@@ -91,9 +91,8 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     >>> len(ji.plot.work_precision(result).axes)
     2
     """
-    gradients = any(
-        point.gradient is not None for row in result.points.values() for point in row
-    )
+    every = chain.from_iterable(result.points.values())
+    gradients = any(point.gradient is not None for point in every)
     if gradients:
         count = 4
         height = 3.6
@@ -107,7 +106,8 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
         for name, row in result.points.items():
             at = _draw_errors(axes, row, quantity, against, styles[name])
             if at is not None and styles[name]["ls"] != "none":
-                ends.append(LineEnd(axes, at, name, styles[name]["color"]))
+                end = LineEnd(axes, at, name, styles[name]["color"])
+                ends.append(end)
         _finish_errors(
             axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity]
         )
@@ -120,9 +120,8 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
             for x in axes.get_legend_handles_labels()[0]
         }
         panels[3].axis("off")
-        panels[3].legend(
-            handles=list(lines.values()), title=_reading_note(result), loc="center"
-        )
+        handles = list(lines.values())
+        panels[3].legend(handles=handles, title=_reading_note(result), loc="center")
     label_ends(figure, ends)
     return figure
 
@@ -183,7 +182,8 @@ def _draw_errors(
         for x in given
     ]
     x, low, high = np.array(spans).T
-    y = np.maximum([point.error[quantity] for point in row], _LEAST)
+    errors = [point.error[quantity] for point in row]
+    y = np.maximum(errors, _LEAST)
     known = np.isfinite(x) & np.isfinite(y)
     if not known.any():
         return None
@@ -198,11 +198,12 @@ def _draw_errors(
         capsize=2,
         **style,
     )
-    failed = known & [STATUS[CODE[point.status]].failure for point in row]
-    axes.plot(
-        x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4}
-    )
-    return float(x[known][-1]), float(y[known][-1])
+    failures = [STATUS[CODE[point.status]].failure for point in row]
+    failed = known & failures
+    hollow = style | {"ls": "none", "mfc": "white", "zorder": 4}
+    axes.plot(x[failed], y[failed], **hollow)
+    last = np.flatnonzero(known)[-1]
+    return float(x[last]), float(y[last])
 
 
 def _finish_errors(axes: Axes, uncertainty: float, x: str, y: str) -> None:
@@ -253,18 +254,17 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     1
     """
     names = list(result.axes)
-    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(result.methods), 1.2, title)
+    height = 0.8 + 0.3 * len(result.methods)
+    figure, grid = new_panels(len(names), height, 1.2, title)
     for i, (axes, name) in enumerate(zip(grid, names)):
-        _draw_classes(
-            axes,
-            np.array([result.slices[method][i].codes for method in result.methods]),
-        )
+        codes = [result.slices[method][i].codes for method in result.methods]
+        _draw_classes(axes, np.array(codes))
         _ticks(axes, "x", name, result.axes[name])
-        axes.set_yticks(range(len(result.methods)), result.methods, fontsize=SMALL)
+        positions = range(len(result.methods))
+        axes.set_yticks(positions, result.methods, fontsize=SMALL)
         axes.tick_params(labelleft=i % COLUMNS == 0)
-        axes.plot(
-            _base_position(result, name), -0.62, "v", color="black", ms=5, clip_on=False
-        )
+        base = _base_position(result, name)
+        axes.plot(base, -0.62, "v", color="black", ms=5, clip_on=False)
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
     _legend_of_classes(figure, result)
     return figure
@@ -299,9 +299,8 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
         )
     names = list(result.axes)
     size = len(names) - 1
-    figure, grid = new_figure(
-        1.6 + 1.5 * size, title or method, size, size, squeeze=False
-    )
+    width = 1.6 + 1.5 * size
+    figure, grid = new_figure(width, title or method, size, size, squeeze=False)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
         _draw_pair(grid[row - 1, column], result, each)
@@ -343,12 +342,13 @@ def _ticks(
     """Label at most `most` values of a map's axis `name` on a panel's axis 'x' or
     'y'.
     """
-    at = range(0, len(values), -(-len(values) // most))
+    stride = -(-len(values) // most)
+    at = range(0, len(values), stride)
     axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_ticks(
-        at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL
-    )
-    axis.set_label_text(_LABELS.get(name, name.replace("_", " ")), fontsize=SMALL)
+    words = [in_words(float(f"{values[i]:.2g}")) for i in at]
+    axis.set_ticks(at, words, fontsize=SMALL)
+    label = _LABELS.get(name, name.replace("_", " "))
+    axis.set_label_text(label, fontsize=SMALL)
 
 
 def _base_position(result: StabilityMap, name: str) -> float:
@@ -356,19 +356,18 @@ def _base_position(result: StabilityMap, name: str) -> float:
     interpolated.
     """
     values = result.axes[name]
-    return float(np.interp(result.base[name], values, np.arange(len(values))))
+    index = np.arange(len(values))
+    return float(np.interp(result.base[name], values, index))
 
 
 def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     """Draw a legend of the classes that occur in the slices."""
-    codes = [
-        each.codes.ravel() for name in result.methods for each in result.slices[name]
-    ]
+    slices = chain.from_iterable(result.slices[x] for x in result.methods)
+    codes = [part.codes.ravel() for part in slices]
     labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
     occurring = np.unique(np.concatenate(codes))
-    legend_below(
-        figure, 4, [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring]
-    )
+    patches = [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring]
+    legend_below(figure, 4, patches)
 
 
 @styled(ValidityMap)
@@ -407,9 +406,8 @@ def validity_map(
             error = np.maximum(result.error(name)[i], _LEAST)
             bottom.plot(result.ratios, error, style, color=colour_of(i))
     for name, style in _STYLES.items():
-        top.axhline(
-            result.law_dispersion[name], color="black", ls=style, lw=1, label=name
-        )
+        limit = result.law_dispersion[name]
+        top.axhline(limit, color="black", ls=style, lw=1, label=name)
         bottom.plot([], [], style, color="black", label=name)
     bottom.axhline(tolerance, color=GREY, lw=1, label=f"tolerance {share(tolerance)}")
     top.set_ylabel("dispersion index (0: one body has it all)")
@@ -465,15 +463,14 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     x = np.arange(len(laws))
     # a panel for each unit: index, name and factor of each velocity
     for top, velocities in tops:
-        for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
+        places = side_by_side(len(velocities))
+        for (i, word, factor), offset in zip(velocities, places):
             if len(velocities) <= len(COLOURS):
                 label = word
             else:
                 label = None
-            v, low, high = (
-                factor
-                * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
-            )
+            spans = np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows])
+            v, low, high = factor * spans.T
             top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
             top.plot(x + offset, v, "o", color=colour_of(i), label=label)
     chosen = laws.index(result.name)
@@ -486,11 +483,11 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     errors = np.array([(c.worst, c.median) for c in rows]).T
     # what is smaller has no place on a logarithmic axis: words
     beyond = errors > ROUNDING
-    lowest = min(result.tolerance / 1000, errors[beyond].min(initial=1.0))
+    least = errors[beyond].min(initial=1.0)
+    lowest = min(result.tolerance / 1000, least)
     worst, median = np.where(beyond, errors, np.nan)
-    bottom.vlines(
-        x, np.where(np.isnan(median), lowest / 2, median), worst, color=GREY, lw=1
-    )
+    foot = np.where(np.isnan(median), lowest / 2, median)
+    bottom.vlines(x, foot, worst, color=GREY, lw=1)
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
     for j in np.flatnonzero(~beyond[0]):

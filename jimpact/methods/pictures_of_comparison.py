@@ -4,6 +4,7 @@ dispersion.
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -69,12 +70,12 @@ def comparison(
     figure, tops, bottom = panels_of_laws(laws, result.scene, names, title, 1.2)
     at = np.arange(len(entries))
     velocity = np.array([x.outcome.velocity for x in entries])
-    wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
+    passed = [bool(entry.audit.consistent) for entry in entries]
+    wrong = ~np.array(passed)
     # a panel for each unit: index, name and factor of each velocity
     for top, velocities in tops:
-        for (i, label, factor), offset in zip(
-            velocities, side_by_side(len(velocities))
-        ):
+        places = side_by_side(len(velocities))
+        for (i, label, factor), offset in zip(velocities, places):
             x = at + offset
             y = factor * velocity[:, i]
             colour = colour_of(i)
@@ -82,9 +83,8 @@ def comparison(
             top.plot(x[wrong], y[wrong], "x", color="black", ms=10)
             if result.measured is not None:
                 level = [factor * result.measured[i]] * 2
-                top.plot(
-                    [-0.5, len(at) - 0.5], level, "--", color=colour, lw=1, zorder=0
-                )
+                ends = [-0.5, len(at) - 0.5]
+                top.plot(ends, level, "--", color=colour, lw=1, zorder=0)
         top.axhline(0, color="black", lw=0.6)
     if result.measured is not None:
         bottom.plot([], [], "--", color="black", lw=1, label="measured")
@@ -98,14 +98,8 @@ def comparison(
     for place in map(laws.index, result.closest):
         label = "closest to the measured velocities"
         for axes in figure.axes:
-            axes.axvspan(
-                place - 0.48,
-                place + 0.48,
-                color=HIGHLIGHT,
-                lw=0,
-                zorder=-1,
-                label=label,
-            )
+            stretch = (place - 0.48, place + 0.48)
+            axes.axvspan(*stretch, color=HIGHLIGHT, lw=0, zorder=-1, label=label)
     legend_below(figure, 4)
     return figure
 
@@ -136,17 +130,12 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
     """
     figure, axes = new_figure(5.4, title)
     allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
-    axes.plot(
-        *_kept_and_spread(result, allowed),
-        ".",
-        color=COLOURS[4],
-        alpha=0.3,
-        ms=3,
-        label="allowed",
-    )
+    coordinates = _kept_and_spread(result, allowed)
+    axes.plot(*coordinates, ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed")
     for i, (name, entry) in enumerate(result.entries.items()):
         at = _kept_and_spread(result, np.asarray(entry.outcome.velocity)[None])
-        mark(axes, np.ravel(at), name, i, bool(entry.audit.consistent))
+        consistent = bool(entry.audit.consistent)
+        mark(axes, np.ravel(at), name, i, consistent)
     axes.set(
         xlabel="energy ratio K_ER = T+/T-",
         ylabel="energy dispersion C_KE (0: equal shares)",
@@ -163,7 +152,7 @@ def _kept_and_spread(
     """
     v = jnp.asarray(after)
     scene = result.scene
-    kept = jax.vmap(lambda x: energy_ratio(scene, result.velocity, x))(v)
-    return np.asarray(kept), np.asarray(
-        jax.vmap(lambda x: energy_dispersion(scene, x))(v)
-    )
+    ratio = partial(energy_ratio, scene, result.velocity)
+    kept = jax.vmap(ratio)(v)
+    spread = jax.vmap(partial(energy_dispersion, scene))(v)
+    return np.asarray(kept), np.asarray(spread)

@@ -67,14 +67,14 @@ class Outcomes(NamedTuple):
         """
         energy = out.energy_change
         work = (solution.code, solution.duration, solution.evaluations)
-        return cls(
-            out.velocity, out.impulse, out.tangential_impulse, energy, out.status, *work
-        )
+        moved = (out.velocity, out.impulse, out.tangential_impulse)
+        return cls(*moved, energy, out.status, *work)
 
     @property
     def failed(self) -> np.ndarray:
         """Mask (r,) of impacts whose status is a failure."""
-        return np.array([STATUS[int(code)].failure for code in self.status], bool)
+        failures = [STATUS[int(code)].failure for code in self.status]
+        return np.array(failures, bool)
 
     def check_first(self, what: str) -> None:
         """Raise a RuntimeError that begins with `what` if the first impact failed."""
@@ -138,11 +138,8 @@ class EnergyNorm(NamedTuple):
             index = np.arange(count)
         else:
             index = np.atleast_1d(np.asarray(watched))
-        whole = (
-            index.ndim == 1
-            and index.size > 0
-            and np.issubdtype(index.dtype, np.integer)
-        )
+        row = index.ndim == 1 and index.size > 0
+        whole = row and np.issubdtype(index.dtype, np.integer)
         if not whole or index.min() < 0 or index.max() >= count:
             raise ValueError(
                 f"Argument `watched` must be indices of coordinates from 0 to "
@@ -155,7 +152,8 @@ class EnergyNorm(NamedTuple):
     def __call__(self, change: np.ndarray) -> np.ndarray:
         """Norms (...) of differences dv (..., n) of velocities."""
         dv = change[..., self.watched]
-        return np.sqrt(np.sum((dv @ self.mass) * dv, axis=-1)) / self.before
+        square = np.sum((dv @ self.mass) * dv, axis=-1)
+        return np.sqrt(square) / self.before
 
 
 def in_batches(
@@ -175,7 +173,8 @@ def in_batches(
         advance(min(size, count - size * len(parts)))
         parts.append(part)
     # without the rows that filled up the last batch
-    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+    joined = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return jax.tree.map(lambda x: x[:count], joined)
 
 
 def at_points(
@@ -209,7 +208,8 @@ def relative_error(value: Any, exact: Any, scale: Any = 1.0) -> np.ndarray:
     """`max_i |value_i - exact_i| / scale` (...) over the last axis of arrays (...,
     n).
     """
-    return np.abs(np.asarray(value) - exact).max(axis=-1) / scale
+    largest = np.abs(np.asarray(value) - exact).max(axis=-1)
+    return largest / scale
 
 
 def seconds(run: Callable[[], Any], count: int = 1) -> float:
@@ -234,7 +234,8 @@ def in_turns(
     """
     # the first call may compile
     warm = [min(seconds(run), seconds(run)) for run in runs]
-    counts = [int(np.clip(SHORT / max(t, 1e-9), 1, MOST_RUNS)) for t in warm]
+    in_short = [SHORT / max(t, 1e-9) for t in warm]
+    counts = [int(np.clip(count, 1, MOST_RUNS)) for count in in_short]
     times: list[list[float]] = [[] for _ in runs]
     for _ in range(repeats):
         for run, count, measured in zip(runs, counts, times):

@@ -69,7 +69,8 @@ class SceneAdvice(Tabular):
             return "kept"
         if self.errors[contact] > 0:
             return "left out: small"
-        block = next((b for b in self.blocks if contact in b.contacts), None)
+        around = (b for b in self.blocks if contact in b.contacts)
+        block = next(around, None)
         if block is None:
             return "left out: open"
         if not block.approaches:
@@ -112,7 +113,8 @@ class SceneAdvice(Tabular):
             else:
                 state = "nothing approaches"
             head.append(f"group of contacts {some}: {state}{angles}")
-        order = np.argsort(-np.nan_to_num(self.errors, nan=np.inf), kind="stable")
+        known_first = -np.nan_to_num(self.errors, nan=np.inf)
+        order = np.argsort(known_first, kind="stable")
         columns = (
             Column("contact"),
             Column("impulse", ".3g", unit="N s"),
@@ -143,7 +145,8 @@ class SceneAdvice(Tabular):
             notes = [f"and {more} more"]
         else:
             notes = []
-        return str(replace(table, rows=table.rows[:PRINTED], notes=notes))
+        printed = replace(table, rows=table.rows[:PRINTED], notes=notes)
+        return str(printed)
 
 
 def simplest_scene(
@@ -201,7 +204,8 @@ def simplest_scene(
         labels = ("",) * scene.contacts
     else:
         labels = tuple(map(str, names))
-    check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
+    one_each = np.empty(len(labels))
+    check_shape("names", one_each, (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
     trial = _ReducedImpact(law, scene, v, norm)
     reference = trial.run([()])
@@ -259,7 +263,8 @@ class _ReducedImpact(NamedTuple):
             own = np.zeros(scene.contacts)
         else:
             own = np.asarray(scene.gaps)
-        gaps = np.tile(own.astype(scene.mass.dtype), (len(left_out), 1))
+        in_precision = own.astype(scene.mass.dtype)
+        gaps = np.tile(in_precision, (len(left_out), 1))
         for row, index in zip(gaps, left_out):
             row[list(index)] = np.inf
         return gaps
@@ -269,7 +274,8 @@ class _ReducedImpact(NamedTuple):
         batches.
         """
         m = self.scene.contacts
-        lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
+        by_memory = ENTRIES // m**2
+        lanes = max(1, min(LANES, m + 1, by_memory))
         run = partial(varied_impacts, self.law, self.scene, self.velocity)
         return in_batches(run, {"gaps": self.gaps(left_out)}, lanes)
 
@@ -296,14 +302,16 @@ def _simplest_friction(
         name for name in ("friction", "tangential_stiffness") if hasattr(law, name)
     ]
     simpler: Any = replace(law, **dict.fromkeys(fields))
-    ways = {"none": trial._replace(law=simpler, scene=_with_tangents(scene, None))}
+    frictionless = _with_tangents(scene, None)
+    ways = {"none": trial._replace(law=simpler, scene=frictionless)}
     if scene.tangents.shape[1] == 2 * scene.contacts:
         along = _with_tangents(scene, _tangents_along_impulses(scene, reference))
         ways["one direction"] = trial._replace(scene=along)
     errors = {}
     chosen = None
     for name, way in ways.items():
-        errors[name] = float(trial.norm(way.changes([()], reference))[0])
+        change = way.changes([()], reference)
+        errors[name] = float(trial.norm(change)[0])
         if chosen is None and errors[name] <= tolerance:
             chosen = way
     return errors, chosen or trial
@@ -323,13 +331,12 @@ def _tangents_along_impulses(scene: Scene, reference: Outcomes) -> jax.Array:
     m = scene.contacts
     impulse = reference.tangential[0].reshape(m, 2)
     size = np.linalg.norm(impulse, axis=1, keepdims=True)
-    direction = np.where(
-        size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]]
-    )
+    moves = size > 0
+    unit = impulse / np.where(moves, size, 1.0)
+    direction = np.where(moves, unit, [[1.0, 0.0]])
     tangents = np.asarray(scene.tangents).reshape(-1, m, 2)
-    return jnp.asarray(
-        np.sum(tangents * direction[None], axis=2).astype(tangents.dtype)
-    )
+    along = np.sum(tangents * direction[None], axis=2)
+    return jnp.asarray(along.astype(tangents.dtype))
 
 
 def _effect_of_each_contact(
@@ -346,15 +353,18 @@ def _effect_of_each_contact(
     norm = trial.norm
     p = np.abs(reference.impulse[0])
     working = np.flatnonzero(p)
-    weight = p * np.sqrt(np.asarray(diagonal(delassus_matrix(trial.scene))))
-    largest = working[np.argsort(-weight[working], kind="stable")][:runs]
+    w = np.asarray(diagonal(delassus_matrix(trial.scene)))
+    weight = p * np.sqrt(w)
+    order = np.argsort(-weight[working], kind="stable")
+    largest = working[order][:runs]
     errors = np.zeros(len(p))
     changes = np.zeros(len(p))
     errors[working] = changes[working] = np.nan
     if len(largest):
         change = trial.changes([(j,) for j in largest], reference)
         errors[largest] = norm(change)
-        changes[largest] = np.abs(change[:, norm.watched]).max(axis=1)
+        watched = np.abs(change[:, norm.watched])
+        changes[largest] = watched.max(axis=1)
     return working, errors, changes
 
 
@@ -373,15 +383,18 @@ def _sufficient_contacts(
     together, the next is kept, and so on with those after it, for at most `runs`
     impacts.
     """
-    order = working[np.argsort(np.nan_to_num(errors[working], nan=-1.0), kind="stable")]
-    left_out = np.flatnonzero(~np.isin(np.arange(len(errors)), working)).tolist()
+    known = np.nan_to_num(errors[working], nan=-1.0)
+    order = working[np.argsort(known, kind="stable")]
+    works = np.isin(np.arange(len(errors)), working)
+    left_out = np.flatnonzero(~works).tolist()
     kept: list[int] = []
     waiting = order.tolist()
     while True:
         last = max(len(waiting) - (not kept), 0)  # one is always kept
         # numbers of waiting contacts to leave out, all from 0 to `last` if `runs`
         # allows it
-        counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
+        tries = min(runs, last) + 1
+        counts = np.unique(np.linspace(0, last, tries, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
         error = trial.norm(trial.changes(sets, reference))
         suffice = np.flatnonzero(error <= tolerance)
@@ -399,4 +412,5 @@ def _sufficient_contacts(
         waiting = left[needed:]
         runs = runs - last
         if runs <= 0 or not waiting:
-            return np.sort(np.array(kept + waiting, dtype=int)), float(error[best])
+            sufficient = np.array(kept + waiting, dtype=int)
+            return np.sort(sufficient), float(error[best])

@@ -91,15 +91,16 @@ class Scaled(NamedTuple):
         impulse = jnp.where(self.happens, p * units.momentum, 0.0)
         finite = jnp.all(jnp.isfinite(impulse))
         if self.dynamics.problem.tangential is not None:
-            tangential = jnp.where(
-                self.happens, p_t * per_tangent(units.momentum, p_t), 0.0
-            )
+            in_si_units = p_t * per_tangent(units.momentum, p_t)
+            tangential = jnp.where(self.happens, in_si_units, 0.0)
             finite = finite & jnp.all(jnp.isfinite(tangential))
         code = jnp.where(self.happens, code, CODE["ok"])
+        status = jnp.where(finite, code, CODE["not_finite"])
+        duration = jnp.where(self.happens, t * units.time, 0.0)
         return Solution(
             impulse,
-            jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32),
-            jnp.where(self.happens, t * units.time, 0.0),
+            status.astype(jnp.int32),
+            duration,
             jnp.asarray(evaluations, jnp.int32),
             tangential,
         )
@@ -117,7 +118,8 @@ def scaled(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Scaled:
     # any approach will do for the placeholder, if its numbers are finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
-    return Scaled(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), happens)
+    tolerance = jnp.asarray(rtol, v.dtype)
+    return Scaled(law.dynamics(contact, tolerance), happens)
 
 
 def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
@@ -173,30 +175,31 @@ class Field(NamedTuple):
         """`x' = -omega c gamma` (m,) at gap velocities `now`; c = 1, or 1/e^2 where
         they open.
         """
-        return -self.omega * _where(now > 0, 1 / self.restitution**2, 1.0) * now
+        c = _where(now > 0, 1 / self.restitution**2, 1.0)
+        return -self.omega * c * now
 
     def force(self, x: Any) -> Any:
         """`p' = F = (eta + 1)/2 omega x^eta` (m,), 0 where x < 0."""
         if isinstance(x, np.ndarray):
             eta = np.asarray(self.exponent, float)
-            return (eta + 1) / 2 * self.omega * np.maximum(x, 0.0) ** eta
-        return (
-            (jnp.asarray(self.exponent, x.dtype) + 1)
-            / 2
-            * self.omega
-            * power(x, self.exponent)
-        )
+            factor = (eta + 1) / 2 * self.omega
+            return factor * np.maximum(x, 0.0) ** eta
+        eta_of_jax = jnp.asarray(self.exponent, x.dtype)
+        factor_of_jax = (eta_of_jax + 1) / 2 * self.omega
+        return factor_of_jax * power(x, self.exponent)
 
     def drag(self, force: Any, p: Any, p_t: Any, slow: Any) -> Any:
         """`p_t' = -mu F u / sqrt(|u|^2 + slow^2)` (t,) of normal forces F (m,).
 
         `u = u- + K_tn p + K_tt p_t`; `slow` (m,) or () is the slip that regularizes it.
         """
-        u = (self.slip + self.cross.T @ p + self.tangent @ p_t).reshape(len(force), -1)
+        by_normal = self.slip + self.cross.T @ p
+        u = (by_normal + self.tangent @ p_t).reshape(len(force), -1)
         square = (u**2).sum(axis=1) + slow**2
         moves = square > 0
         drag = self.friction * force / _where(moves, square, 1.0) ** 0.5
-        return -(_where(moves, drag, 0.0)[:, None] * u).ravel()
+        per_slip = _where(moves, drag, 0.0)
+        return -(per_slip[:, None] * u).ravel()
 
     def rates(self, x: Any, p: Any, p_t: Any, slow: Any) -> tuple[Any, Any, Any]:
         """(x', p', p_t'); an open contact stays at its x <= 0, as solvers cannot
@@ -205,7 +208,8 @@ class Field(NamedTuple):
         closing = self.closing(self.gap_velocity(p, p_t))
         force = self.force(x)
         opened = (x <= 0) & (closing < 0)
-        return _where(opened, 0.0, closing), force, self.drag(force, p, p_t, slow)
+        inwards = _where(opened, 0.0, closing)
+        return inwards, force, self.drag(force, p, p_t, slow)
 
     def at_work(self, x: Any, p: Any, p_t: Any) -> Any:
         """`max(x_j, -gamma_j)` (): positive while a contact is loaded or approaches."""
@@ -232,7 +236,8 @@ def field_of(problem: Scaled) -> Field:
         coupling = Sparse(one, off, dynamics.structure)
     # dense; its diagonal is 1, `off` the upper triangle by rows
     elif dynamics.structure is None:
-        upper = jnp.zeros((m, m), off.dtype).at[jnp.triu_indices(m, 1)].set(off)
+        places = jnp.triu_indices(m, 1)
+        upper = jnp.zeros((m, m), off.dtype).at[places].set(off)
         coupling = unit(upper) + upper + upper.T
     none = jnp.zeros((m, 0), off.dtype)
     cross = none
@@ -269,7 +274,8 @@ def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     program = dynamics.program()
     leaves = dynamics.columns()[0]
     p, p_t, _, code, passes = evaluate(program, leaves)
-    _, _, t, _, _ = evaluate(dataclasses.replace(program, with_end_time=True), leaves)
+    to_the_end = dataclasses.replace(program, with_end_time=True)
+    _, _, t, _, _ = evaluate(to_the_end, leaves)
     evaluations = (STAGES + 1) * passes[0, 0]  # of all passes, rejected ones included
     return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], p_t[:, 0])
 
@@ -278,7 +284,8 @@ def implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     """The law's method 'implicit', without events; `setting` is the rtol."""
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="implicit")
-    p, p_t, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
+    leaves = dynamics.columns()[0]
+    p, p_t, t, code, passes = evaluate(dynamics.program(), leaves)
     forces = _FORCES_A_STEP * passes[0, 0]
     return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], p_t[:, 0])
 
@@ -348,11 +355,12 @@ def in_time(step: Step, stages: int) -> Solve:
             """State after one step, indentations clamped at 0."""
             x, p, p_t, force = step(field, h, walk)
             gamma = field.gap_velocity(p, p_t)
-            return Walk(jnp.maximum(x, 0.0), p, p_t, gamma, force, walk.steps + 1)
+            clamped = jnp.maximum(x, 0.0)
+            return Walk(clamped, p, p_t, gamma, force, walk.steps + 1)
 
-        first = Walk(
-            *field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32)
-        )
+        first_force = field.force(field.x)
+        no_steps = jnp.zeros((), jnp.int32)
+        first = Walk(*field.start, field.gamma, first_force, no_steps)
         end, code = until_over(advance, first, problem.dynamics.max_steps)
         time = h * end.steps.astype(h.dtype)
         return problem.solution(end.p, time, stages * end.steps, code, end.p_t)
@@ -382,7 +390,8 @@ def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
     within one of them, `mu F h/2 |K_tt|` with the largest absolute row sum: stable for
     whatever step; contacts that should stick creep by O(step).
     """
-    stiffest = jnp.max(jnp.sum(jnp.abs(field.tangent), axis=1), initial=0.0)
+    of_row = jnp.sum(jnp.abs(field.tangent), axis=1)
+    stiffest = jnp.max(of_row, initial=0.0)
 
     def dragged(force: jax.Array, p: jax.Array, p_t: jax.Array) -> jax.Array:
         """Tangential impulses (t,) after friction has acted for half a step."""
@@ -391,7 +400,8 @@ def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
 
     p = walk.p + 0.5 * h * walk.force
     p_t = dragged(walk.force, p, walk.p_t)
-    x = jnp.maximum(walk.x + h * field.closing(field.gap_velocity(p, p_t)), 0.0)
+    closing = field.closing(field.gap_velocity(p, p_t))
+    x = jnp.maximum(walk.x + h * closing, 0.0)
     force = field.force(x)
     p = p + 0.5 * h * force
     return StepEnd(x, p, dragged(force, p, p_t), force)
@@ -448,18 +458,20 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
     def force(energy: jax.Array) -> jax.Array:
         """Dimensionless contact force at potential energy E_j."""
         positive = energy > 0
-        root = jnp.where(
-            positive, jnp.where(positive, 2 * energy, 1.0) ** (eta / (eta + 1)), 0.0
-        )
+        doubled = jnp.where(positive, 2 * energy, 1.0)
+        root = jnp.where(positive, doubled ** (eta / (eta + 1)), 0.0)
         return (eta + 1) / 2 * field.omega * root
 
     # at the first touch the energy is that of the step itself
     f = force(energy)
-    f_start = jnp.where(jnp.any(energy > 0), f, force(approach * dp))
+    touch = force(approach * dp)
+    f_start = jnp.where(jnp.any(energy > 0), f, touch)
     primary = jnp.argmax(f_start)
     scale = dp / f_start[primary]
-    root_of_first = (scale * force(approach)) * jnp.where(approach > 0, 1.0, 0.0)
-    increment = jnp.where(energy > 0, scale * f, power(root_of_first, eta + 1))
+    approaches = jnp.where(approach > 0, 1.0, 0.0)
+    root_of_first = (scale * force(approach)) * approaches
+    first = power(root_of_first, eta + 1)
+    increment = jnp.where(energy > 0, scale * f, first)
     is_primary = jnp.arange(len(gamma)) == primary  # in batches faster than an index
     increment = jnp.where(is_primary, dp, increment)
     increment = increment * _emptying(field, walk, is_primary, increment)
@@ -469,7 +481,8 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
     middle = 0.5 * (gamma + after)
     rate = jnp.where(middle > 0, 1 / field.restitution**2, 1.0)
     left = jnp.maximum(energy - rate * middle * increment, 0.0)
-    left = jnp.where(left > EMPTY * jnp.max(energy + approach**2), left, 0.0)
+    nothing = EMPTY * jnp.max(energy + approach**2)
+    left = jnp.where(left > nothing, left, 0.0)
     return ImpulseWalk(after, left, walk.p + increment, walk.steps + 1)
 
 
@@ -496,12 +509,12 @@ def _emptying(
     )
     b = energy * e**2 / dp
     expands = (gamma + 0.5 * dgamma > 0) & (energy > 0)
-    root = jnp.sqrt(
-        jnp.maximum(jnp.where(expands, gamma**2 + 2 * dgamma * b, 1.0), 0.0)
-    )
+    square = jnp.where(expands, gamma**2 + 2 * dgamma * b, 1.0)
+    root = jnp.sqrt(jnp.maximum(square, 0.0))
     denominator = jnp.where(expands, gamma + root, 1.0)
     fraction = 2 * b / jnp.where(denominator > 0, denominator, 1.0)
-    return jnp.where(expands & (denominator > 0) & (fraction < 1), fraction, 1.0)
+    within = (denominator > 0) & (fraction < 1)
+    return jnp.where(expands & within, fraction, 1.0)
 
 
 # -------------------------------------------------------------------------------
@@ -550,7 +563,8 @@ def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
             evaluations = stages * steps + 1
         ended = result.result == diffrax.RESULTS.event_occurred
         code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
-        return problem.solution(result.ys[1][-1], jnp.nan, evaluations, code, none)
+        impulse = result.ys[1][-1]
+        return problem.solution(impulse, jnp.nan, evaluations, code, none)
 
     return solve
 
@@ -606,7 +620,8 @@ def by_scipy(name: str) -> Solve:
             ended = result.status == 1
             reached = (float(result.t[-1]), result.y[:, -1])
         time, y = reached
-        _, p, p_t = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
+        values = np.split(y, parts)
+        _, p, p_t = (jnp.asarray(x, traced.gamma.dtype) for x in values)
         code = CODE["ok" if ended else "max_steps"]
         return problem.solution(p, jnp.asarray(time), count, code, p_t)
 

@@ -76,7 +76,8 @@ class Axis(NamedTuple):
             zero = []
         else:
             zero = [0.0]
-        return np.append(zero, np.geomspace(self.least, self.high, count - len(zero)))
+        geometric = np.geomspace(self.least, self.high, count - len(zero))
+        return np.append(zero, geometric)
 
 
 _AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
@@ -184,7 +185,8 @@ class StabilityMap(Tabular):
         """
         slices = *self.slices[method], self.sampled[method]
         codes = np.concatenate([each.codes.ravel() for each in slices])
-        return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
+        numbers = np.bincount(codes, minlength=len(CLASSES))
+        return dict(zip(CLASSES, numbers.tolist()))
 
     def to_dict(self) -> dict[str, Any]:
         """Axes, classes, errors and counts of classes by method, as a JSON file can
@@ -228,9 +230,8 @@ class StabilityMap(Tabular):
         ]
         counts = [Column(name, lambda count: str(count or "")) for name in CLASSES]
         rows = [[name, *self.counts(name).values()] for name in self.methods]
-        return Table(
-            [Column("method"), *counts], rows, head, left_out_notes(self.left_out)
-        )
+        columns = [Column("method"), *counts]
+        return Table(columns, rows, head, left_out_notes(self.left_out))
 
 
 @full_precision
@@ -306,15 +307,15 @@ def stability_map(
     chosen = _methods(methods, setup)
     values = _axis_values(axes, as_whole("resolution", resolution, 2), setup.axes)
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {
-        name: float(x) for name, x in _checked("base", base or {}, setup.axes).items()
-    }
+    given = _checked("base", base or {}, setup.axes)
+    start |= {name: float(x) for name, x in given.items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in values]
     if slices == "pairs":
         axis_sets += list(combinations(values, 2))
     parts = [_slice_points(start, values, names) for names in axis_sets]
     sampled = _sample_points(start, values, samples, seed)
-    points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
+    of_slices = (part.reshape(-1, len(AXES)) for part in parts)
+    points = np.concatenate([*of_slices, sampled])
     runners = cache(partial(runner, max_steps, setup))
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
@@ -442,9 +443,8 @@ def _methods(
 
     Only those that JAX can batch are known.
     """
-    able = [
-        m for m in CONTENDERS.values() if m.jax and (m.friction or not setup.friction)
-    ]
+    batched = (m for m in CONTENDERS.values() if m.jax)
+    able = [m for m in batched if m.friction or not setup.friction]
     known = {m.name: m for m in able}
     defaults = FRICTION_NAMES if setup.friction else NAMES
     return contenders_of("methods", defaults if methods is None else methods, known)
@@ -461,7 +461,8 @@ def _checked(
         check_choice(argument, name, names)
         axis = _AXES[name]
         of_axis = f"{argument}[{name!r}]"
-        check_values(of_axis, as_axis(of_axis, value), low=axis.low, high=axis.high)
+        numbers = as_axis(of_axis, value)
+        check_values(of_axis, numbers, low=axis.low, high=axis.high)
         if name == "balls" and (np.asarray(value) % 1).any():
             raise ValueError(
                 f"Argument `{of_axis}` must hold whole numbers, but has {value}."
@@ -503,11 +504,16 @@ def _slice_points(
     """Points (K_1 .. K_d, 7) over the values of the d axes `varied`, elsewhere at the
     base.
     """
-    columns = [
-        axes[name] if name in varied else np.array([base[name]]) for name in AXES
-    ]
-    grid = np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1)
-    return grid.reshape(*(len(axes[name]) for name in varied), len(AXES))
+    columns = []
+    for name in AXES:
+        if name in varied:
+            columns.append(axes[name])
+        else:
+            columns.append(np.array([base[name]]))
+    of_axes = np.meshgrid(*columns, indexing="ij")
+    grid = np.stack(of_axes, axis=-1)
+    shape = (len(axes[name]) for name in varied)
+    return grid.reshape(*shape, len(AXES))
 
 
 def _sample_points(
@@ -523,13 +529,14 @@ def _sample_points(
     from scipy.stats import qmc  # late: slow to import
 
     points = np.tile([base[name] for name in AXES], (samples, 1))
-    unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(
-        samples
-    )
+    generator = np.random.default_rng(seed)
+    cube = qmc.LatinHypercube(len(axes), rng=generator)
+    unit = cube.random(samples)
     for column, (name, values) in zip(unit.T, axes.items()):
         index = column * (len(values) - 1)
         if name == "balls":
-            points[:, AXES.index(name)] = values[np.round(index).astype(int)]
+            nearest = np.round(index).astype(int)
+            points[:, AXES.index(name)] = values[nearest]
             continue
         powers = bool((values > 0).all()) and name != "exponent"
         if powers:
@@ -573,7 +580,8 @@ def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
     """
     kappa = jnp.asarray(kappa, float)
     mu = jnp.asarray(mu, float)
-    mass = jnp.where(jnp.arange(balls) == balls // 2, mu, jnp.ones_like(mu))
+    is_middle = jnp.arange(balls) == balls // 2
+    mass = jnp.where(is_middle, mu, jnp.ones_like(mu))
     return mass, stiffness_of(kappa, balls - 1)
 
 
@@ -586,9 +594,8 @@ def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
     [1.0, 1.0, 10.0]
     """
     kappa = jnp.asarray(kappa, float)
-    return jnp.where(
-        jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa)
-    )
+    right = jnp.arange(contacts) >= (contacts + 1) // 2
+    return jnp.where(right, kappa, jnp.ones_like(kappa))
 
 
 # Of points (L, 7) and settings () or (L,): outcomes (L,), and the energy gained (L,)
@@ -633,16 +640,16 @@ def references(
     Runs of 'time' at `REFERENCE_RTOL`.
     """
     groups = list(setup.groups(points))
-    exact = np.full(
-        (len(points), max((setup.size(n) for _, n in groups), default=0)), np.nan
-    )
+    largest = max((setup.size(n) for _, n in groups), default=0)
+    exact = np.full((len(points), largest), np.nan)
     for at, n in groups:
         # points that differ in their setting alone (column 0) share a run
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
         out, _ = runners(CONTENDERS["time"], n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
-        velocity = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
+        of_unique = np.where(ended[:, None], out.velocity, np.nan)
+        velocity = of_unique[np.ravel(back)]
         exact[at, : setup.size(n)] = velocity
         advance(len(at))
     return exact, _confirm(points, setup, exact)
@@ -670,9 +677,11 @@ def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmatio
     differences = []
     for i in candidates[::stride]:
         balls = int(points[i, AXES.index("balls")])
-        law, scene, v = setup.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
+        numbers = list(map(float, points[i]))
+        law, scene, v = setup.impact_at(numbers, balls, CHECK_STEPS)
         _, out = solved(CONTENDERS[name], law, scene, v, rtol)
-        differences.append(float(relative_error(out.velocity, exact[i, : len(v)])))
+        difference = relative_error(out.velocity, exact[i, : len(v)])
+        differences.append(float(difference))
     agree = sum(x <= within for x in differences)
     largest = max(differences, default=float("nan"))
     return Confirmation(len(points), len(differences), agree, largest, within)
@@ -687,12 +696,14 @@ def _is_quick(point: np.ndarray, setup: Setup) -> bool:
     `spread` of the slowest's.
     """
     _, kappa, eta, e, mass_ratio, balls, _ = map(float, point)
-    spread = (
-        max(kappa, 1 / kappa) ** (1 / (eta + 1))
-        * max(mass_ratio, 1 / mass_ratio) ** 0.5
-    )
+    by_stiffness = max(kappa, 1 / kappa) ** (1 / (eta + 1))
+    by_mass = max(mass_ratio, 1 / mass_ratio) ** 0.5
+    spread = by_stiffness * by_mass
     few = (balls if setup.scene is None else setup.scene.contacts) <= QUICK_BALLS
-    return few and e >= RECLOSING and np.sqrt(2) * eta / e * spread < QUICK_RATIO
+    if not (few and e >= RECLOSING):
+        return False
+    fastest = np.sqrt(2) * eta / e
+    return fastest * spread < QUICK_RATIO
 
 
 # ---------------------------------------------------------------------------------
@@ -737,11 +748,10 @@ def classes_of(
         wrong = at[codes[at] == WRONG]
         if len(wrong):
             finer, _ = run(points[wrong], FINER * setting[wrong])
-            falls = (
-                relative_error(finer.velocity, exact[wrong, :size])
-                < FALLS * errors[wrong]
-            )
-            codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
+            finer_errors = relative_error(finer.velocity, exact[wrong, :size])
+            falls = finer_errors < FALLS * errors[wrong]
+            converged = finer.code == CODE["ok"]
+            codes[wrong[converged & ~falls]] = STALLS
         advance(len(group))
     return codes, errors
 

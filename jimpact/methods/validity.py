@@ -52,7 +52,8 @@ class ValidityMap(Tabular):
         max |v-|.
         """
         check_choice("law", law, self.laws)
-        return relative_error(self.velocity, self.laws[law], np.abs(self.before).max())
+        fastest = np.abs(self.before).max()
+        return relative_error(self.velocity, self.laws[law], fastest)
 
     def limit(self, law: str, tolerance: float = 1e-2) -> np.ndarray:
         """Stiffness ratios (x,) that bound the range in which a law is within
@@ -68,7 +69,8 @@ class ValidityMap(Tabular):
         else:
             order = slice(None)
         # number of ratios from that end of the map that are all within
-        run = np.logical_and.accumulate(inside[:, order], axis=1).sum(axis=1)
+        all_within = np.logical_and.accumulate(inside[:, order], axis=1)
+        run = all_within.sum(axis=1)
         at = self.ratios[order][np.maximum(run - 1, 0)]
         return np.where(run > 0, at, np.nan)
 
@@ -85,9 +87,8 @@ class ValidityMap(Tabular):
             Column("binary_up_to", _range("<="), "binary within 1 %"),
             Column("moreau_from", _range(">="), "Moreau within 1 %"),
         )
-        return Table(
-            columns, [*zip(self.exponents, self.limit("binary"), self.limit("moreau"))]
-        )
+        limits = self.limit("binary"), self.limit("moreau")
+        return Table(columns, [*zip(self.exponents, *limits)])
 
 
 def _range(sign: str) -> Callable[[Any], str]:
@@ -139,7 +140,8 @@ def validity_map(
         raise ValueError(
             "Argument `velocity` must not be zero: nothing happens at rest."
         )
-    if scene.contacts < 2 or not np.asarray(scene.closed).all():
+    closed = np.asarray(scene.closed)
+    if scene.contacts < 2 or not closed.all():
         raise ValueError(
             "Argument `scene` must have two or more contacts, all closed, but has "
             f"{scene.contacts}, {int(np.asarray(scene.closed).sum())} of them closed."
@@ -152,15 +154,18 @@ def validity_map(
     eta = as_axis("exponents", exponents).astype(v.dtype)
     check_values("ratios", ratio, low=0.0, open_low=True)
     check_values("exponents", eta, low=1.0)
-    if (np.diff(np.asarray(ratio)) <= 0).any():
+    steps = np.diff(np.asarray(ratio))
+    if (steps <= 0).any():
         raise ValueError("Argument `ratios` must rise, but does not.")
     e = as_numbers(
         "restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts
     )
     shape = len(eta), len(ratio)
     # one impact for each exponent and ratio; k (x r, m) = ratio^(j - 1)
-    exponents, ratios = (x.ravel() for x in jnp.meshgrid(eta, ratio, indexing="ij"))
-    k = ratios[:, None] ** jnp.arange(scene.contacts).astype(v.dtype)[None, :]
+    grid = jnp.meshgrid(eta, ratio, indexing="ij")
+    exponents, ratios = (x.ravel() for x in grid)
+    place = jnp.arange(scene.contacts).astype(v.dtype)
+    k = ratios[:, None] ** place[None, :]
     law = LZB(e.astype(v.dtype), k[0], eta[0])
     out = varied_impacts(law, scene, v, {"stiffness": k, "exponent": exponents})
     spread = jax.vmap(partial(dispersion_index, scene))(out.velocity)

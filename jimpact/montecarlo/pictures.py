@@ -54,10 +54,10 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = result.first["gaps"].shape[1] > 0
     mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
-    figure = Figure(figsize=(WIDTH, max(4.8, 2.0 * len(bodies))))
-    figure.suptitle(
-        title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left"
-    )
+    height = max(4.8, 2.0 * len(bodies))
+    figure = Figure(figsize=(WIDTH, height))
+    heading = title or textwrap.fill(result.description, _TITLE)
+    figure.suptitle(heading, x=0.01, ha="left")
     panels = figure.subplot_mosaic(mosaic)
     for body in bodies:
         axes = panels[str(body)]
@@ -78,7 +78,8 @@ def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     each = max(1, len(counts) // _BARS)  # bins of a bar
     # bins in whole bars; the last bar takes the rest
     whole = len(counts) // each * each
-    bars = counts[:whole].reshape(-1, each).sum(axis=1)
+    groups = counts[:whole].reshape(-1, each)
+    bars = groups.sum(axis=1)
     bars[-1] += counts[whole:].sum()
     share = 100 * bars / max(result.count, 1)
     colour = colour_of(body)
@@ -88,7 +89,8 @@ def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     mean = result.mean[body]
     low, high = result.quantile([0.05, 0.95])[:, body]
     height = _MEAN_AT * top
-    axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
+    level = [height, height]
+    axes.plot([low, high], level, "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
     axes.set_ylim(0, _TOP * top)
     label = (
@@ -108,9 +110,12 @@ def _most_correlated_gaps(result: MonteCarlo, body: int) -> list[int]:
     """
     std = np.sqrt(np.diag(result.gap_covariance))
     varies = std > 0
-    correlation = np.abs(result.cross_covariance[body]) / np.where(varies, std, 1.0)
+    covariance = np.abs(result.cross_covariance[body])
+    correlation = covariance / np.where(varies, std, 1.0)
     # by the last key first
-    return sorted(np.lexsort((-std, -np.where(varies, correlation, -1.0)))[:2].tolist())
+    of_varying = np.where(varies, correlation, -1.0)
+    best = np.lexsort((-std, -of_varying))[:2]
+    return sorted(best.tolist())
 
 
 def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
@@ -120,10 +125,12 @@ def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
     Of a single random gap: v+ over this gap.
     """
     first = result.first
-    fine = np.isfinite(first["velocity"]).all(axis=1) & ~FAILURE[first["status"]]
+    finite = np.isfinite(first["velocity"]).all(axis=1)
+    fine = finite & ~FAILURE[first["status"]]
     velocity = first["velocity"][fine, body]
     gaps = _most_correlated_gaps(result, body)
-    x, x_label = _in_units(result, first["gaps"][fine, gaps[0]], gaps[0])
+    x_gaps = first["gaps"][fine, gaps[0]]
+    x, x_label = _in_units(result, x_gaps, gaps[0])
     axes.set_xlabel(x_label)
     axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
     axes.grid(False)
@@ -132,10 +139,12 @@ def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
         axes.plot(x, velocity, ".", ms=3, color=colour_of(body))
         axes.set_ylabel(label)
         return
-    y, y_label = _in_units(result, first["gaps"][fine, gaps[1]], gaps[1])
+    y_gaps = first["gaps"][fine, gaps[1]]
+    y, y_label = _in_units(result, y_gaps, gaps[1])
     axes.set_ylabel(y_label)
     colours = matplotlib.colormaps["cividis"]
-    dots = axes.scatter(x, y, s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
+    coloured = {"c": velocity, "cmap": colours}
+    dots = axes.scatter(x, y, s=_DOT, **coloured, lw=0, rasterized=True)
     axes.figure.colorbar(dots, ax=axes, label=label)
     axes.set_aspect("equal" if _alike(x, y) else "auto")
 

@@ -105,7 +105,8 @@ class MonteCarlo(Tabular):
     @property
     def standard_error(self) -> np.ndarray:
         """Standard error of the mean, `std / sqrt(count)` (n,) [m/s]."""
-        return np.sqrt(np.diag(self.covariance) / max(self.count, 1))
+        variance = np.diag(self.covariance)
+        return np.sqrt(variance / max(self.count, 1))
 
     @property
     def std(self) -> np.ndarray:
@@ -169,7 +170,8 @@ class MonteCarlo(Tabular):
             Column("maximum", ".5f"),
         )
         names = [f"v{i + 1}+" for i in range(len(self.mean))]
-        values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
+        quantiles = self.quantile(REPORTED)
+        values = self.std, *quantiles, self.minimum, self.maximum
         rows = [*zip(names, self.mean, self.standard_error, *values)]
         head = [
             f"{counted(self.samples, 'sample')} of {self.description}",

@@ -110,9 +110,8 @@ def monte_carlo(
     >>> [round(float(v), 2) for v in result.quantile(0.9)]  # one of two mirror images
     [-0.6, 0.16, 1.24]
     """
-    run = planned_run(
-        Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples
-    )
+    sources = Sources(law, velocity, gaps)
+    run = planned_run(sources, scene, samples, key, chunk, bins, keep_samples)
     check_executor(executor)
     if workers is not None and executor != "threads":
         raise ValueError(
@@ -129,7 +128,8 @@ def monte_carlo(
     else:
         store = Store(folder, run.identity)
     total, resumed, rate = _all_chunks(run, executor, workers, store, progress)
-    result = result_of(run, total, resumed, rate, _gap_scale(run.sources, scene))
+    scale = _gap_scale(run.sources, scene)
+    result = result_of(run, total, resumed, rate, scale)
     failed = result.samples - result.count
     if failed:
         text = ", ".join(f"{count} {name}" for name, count in result.statuses.items())
@@ -188,8 +188,10 @@ def _all_chunks(
         with counting_bar(run.samples, "samples", progress, resumed) as advance:
             total = read(0) or new(first_chunk(run, recorded))
             tolerance = Tolerance(*map(float, total["tolerance"]))
-            missing = (n for n in range(1, run.chunks) if n not in stored)
-            tasks = (run.task(number, tolerance, total["ends"]) for number in missing)
+            numbers = range(1, run.chunks)
+            missing = (n for n in numbers if n not in stored)
+            ends = total["ends"]
+            tasks = (run.task(number, tolerance, ends) for number in missing)
             with closing(_computed_chunks(executor, workers, run, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     if number in stored:
@@ -211,7 +213,10 @@ def _all_chunks(
     # samples and time after the first computed chunk, and at the end
     before, begin = times[1 if len(times) > 2 else 0]
     after, end = times[-1]
-    return total, resumed, (after - before) / (end - begin) if after > before else 0.0
+    rate = 0.0
+    if after > before:
+        rate = (after - before) / (end - begin)
+    return total, resumed, rate
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
@@ -288,7 +293,8 @@ def _picklable(run: Run) -> Work:
     except ImportError:
         dumps = pickle.dumps
     try:
-        return functools.partial(_compute, dumps(replace(run, rows={})), run.x64)
+        pickled = dumps(replace(run, rows={}))
+        return functools.partial(_compute, pickled, run.x64)
     # objects refuse to be pickled in many ways; threads need no pickle
     except Exception:
         return run

@@ -112,7 +112,8 @@ def draw(
     else:
         law = sources.law
     velocity = entries("velocity", scene.size, keys[:, 1], False)
-    return Sources(law, velocity, entries("gaps", scene.contacts, keys[:, 2], True))
+    gaps = entries("gaps", scene.contacts, keys[:, 2], True)
+    return Sources(law, velocity, gaps)
 
 
 @precise_jit
@@ -134,7 +135,8 @@ def impacts(
     ) -> tuple[jax.Array, jax.Array]:
         """v+ (n,) and status () of one sample with v- `velocity` (n,) and gaps (m,)."""
         code = jnp.where(within_domains(law), 0, BAD_LAW)
-        code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
+        finite = jnp.all(jnp.isfinite(velocity))
+        code = jnp.where(finite, code, BAD_VELOCITY)
         one_scene = scene
         if gaps is not None:
             fine = jnp.isfinite(gaps) & (rounded_gaps(gaps) >= 0)
@@ -142,10 +144,12 @@ def impacts(
             one_scene = with_gaps(scene, jnp.where(fine, gaps, 0))
         velocity = jnp.where(code == 0, velocity, 0)  # at rest: over at once
         out = impact(law, one_scene, velocity, rtol=rtol)
-        return out.velocity, jnp.where(code == 0, out.status, code.astype(jnp.int32))
+        status = jnp.where(code == 0, out.status, code.astype(jnp.int32))
+        return out.velocity, status
 
     axes = tuple(eqx.if_array(0) if random[name] else None for name in vars(drawn))
-    return eqx.filter_vmap(one, in_axes=axes, axis_size=size)(*vars(drawn).values())
+    lanes = eqx.filter_vmap(one, in_axes=axes, axis_size=size)
+    return lanes(*vars(drawn).values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +189,8 @@ class Run:
         rtol = task.tolerance.rtol
         with self.flags():
             drawn, scene = self._drawn(task, device)
-            velocity, status = impacts(
-                drawn, scene, random, self.size, np.asarray(rtol) if rtol else None
-            )
+            tolerance = np.asarray(rtol) if rtol else None
+            velocity, status = impacts(drawn, scene, random, self.size, tolerance)
         constant = np.zeros((self.size, 0))
         samples: dict[str, Any] = {
             "velocity": velocity,
@@ -223,7 +226,8 @@ class Run:
         rows = {}
         for name, values in self.rows.items():
             own = values[number * size : (number + 1) * size]
-            rows[name] = np.pad(own, ((0, size - len(own)), (0, 0)), mode="edge")
+            missing = size - len(own)
+            rows[name] = np.pad(own, ((0, missing), (0, 0)), mode="edge")
         return Task(number, self.count(number), ends, rows, tolerance)
 
     def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
@@ -253,17 +257,16 @@ class Run:
         """Set precision and kind of random bits of the run in JAX, in this thread,
         while open.
         """
-        with (
-            jax.enable_x64(self.x64),
-            jax.threefry_partitionable(self.threefry_partitionable),
-        ):
+        bits = jax.threefry_partitionable(self.threefry_partitionable)
+        with jax.enable_x64(self.x64), bits:
             yield
 
     def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Sources, Scene]:
         """Draws of a task's chunk, and the scene, on a device: programs run where
         inputs are.
         """
-        key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
+        raw = jnp.asarray(self.key)
+        key = jax.random.wrap_key_data(raw, impl=self.key_kind)
         key = jax.random.fold_in(key, np.uint32(task.number))
         lanes = np.arange(self.size, dtype=np.uint32)
         sources, scene, key, lanes, rows = jax.tree.map(
@@ -291,7 +294,8 @@ class Run:
             "version of jimpact": jimpact.__version__,
             "version of jax": jax.__version__,
         }
-        return {name: fingerprint(value) for name, value in parts.items()} | versions
+        hashes = {name: fingerprint(value) for name, value in parts.items()}
+        return hashes | versions
 
     @property
     def description(self) -> str:
@@ -374,7 +378,8 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     """
     law = sources.law
     gaps = sources.gaps
-    if isinstance(law, type) or not (isinstance(law, Law) or callable(law)):
+    is_law = isinstance(law, Law) or callable(law)
+    if isinstance(law, type) or not is_law:
         raise TypeError(
             f"Argument `law` must be a Law or a function key -> Law, but is {law!r}."
         )
@@ -427,12 +432,12 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
         and key.shape == (2,)
     ):
         key = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")
-    if not (
-        isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    ):
+    of_keys = jax.dtypes.prng_key
+    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, of_keys)):
         raise TypeError(
             f"Argument `key` must be a JAX random key or an integer, but is {key!r}."
         )
     if key.shape != ():
         raise ValueError(f"Argument `key` must be one key, but has shape {key.shape}.")
-    return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
+    data = jax.random.key_data(key)
+    return np.asarray(data), str(jax.random.key_impl(key))

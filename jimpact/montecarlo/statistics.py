@@ -67,7 +67,8 @@ def part(chunk: Chunk, prefix: str) -> Chunk:
     names.
     """
     start = f"{prefix}."
-    return {k.removeprefix(start): v for k, v in chunk.items() if k.startswith(start)}
+    named_so = {k: v for k, v in chunk.items() if k.startswith(start)}
+    return {k.removeprefix(start): v for k, v in named_so.items()}
 
 
 def moments(values: np.ndarray) -> Chunk:
@@ -109,9 +110,8 @@ def merged(a: Chunk, b: Chunk) -> Chunk:
     used = a["used"] + b["used"]
     n = max(used, 1)
     d = b["mean"] - a["mean"]
-    products = (
-        a["products"] + b["products"] + np.outer(d, d) * (a["used"] * b["used"] / n)
-    )
+    weight = a["used"] * b["used"] / n
+    products = a["products"] + b["products"] + np.outer(d, d) * weight
     # without samples a mean is 0
     mean = a["mean"] + d * (b["used"] / n)
     return {"used": np.array(used), "mean": mean, "products": products}
@@ -149,7 +149,9 @@ def bin_counts(values: np.ndarray, ends: np.ndarray, bins: int) -> np.ndarray:
 
 def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
     """Bin edges (d, bins + 1), evenly spaced between the ends (d, 2)."""
-    return np.linspace(ends[:, 0], ends[:, 1], bins + 1, axis=1)
+    low_ends = ends[:, 0]
+    high_ends = ends[:, 1]
+    return np.linspace(low_ends, high_ends, bins + 1, axis=1)
 
 
 def binned_quantiles(
@@ -169,15 +171,18 @@ def binned_quantiles(
     """
     first = np.minimum(low, ends[:, 0])
     last = np.maximum(high, ends[:, 1])
-    edges = np.column_stack([first, bin_edges(ends, counts.shape[1] - 2), last])
+    inner = bin_edges(ends, counts.shape[1] - 2)
+    edges = np.column_stack([first, inner, last])
     # number of values below each edge
-    below = np.cumsum(np.column_stack([np.zeros(len(counts)), counts]), axis=1)
+    from_zero = np.column_stack([np.zeros(len(counts)), counts])
+    below = np.cumsum(from_zero, axis=1)
     # from above: of an empty stretch between two bins the lower end is taken
-    quantiles = [
-        np.interp(-np.asarray(q) * b[-1], -b[::-1], edge[::-1])
-        for b, edge in zip(below, edges)
-    ]
-    return np.clip(np.stack(quantiles, axis=-1), low, high)
+    quantiles = []
+    for b, edge in zip(below, edges):
+        wanted = np.asarray(q) * b[-1]
+        quantiles.append(np.interp(-wanted, -b[::-1], edge[::-1]))
+    joined_quantiles = np.stack(quantiles, axis=-1)
+    return np.clip(joined_quantiles, low, high)
 
 
 def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
@@ -191,15 +196,13 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
     count = task.count
     fine = ~FAILURE[status]
     # (n + m, C): velocities after and random gaps of the C samples
-    values = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(
-        np.float64
-    )
+    both = np.concatenate([samples["velocity"].T, samples["gaps"].T])
+    values = both.astype(np.float64)
     ends = task.ends
     if ends is None:  # the first chunk sets the histograms
         if not fine.any():
-            counts = ", ".join(
-                f"{k} {name}" for name, k in named(np.bincount(status)).items()
-            )
+            by_status = named(np.bincount(status)).items()
+            counts = ", ".join(f"{k} {name}" for name, k in by_status)
             raise RuntimeError(
                 f"None of the first {len(status)} samples gave a usable outcome: "
                 f"{counts}."
@@ -259,4 +262,5 @@ def joined(before: Chunk, chunk: Chunk) -> Chunk:
 
 def named(counts: np.ndarray) -> dict[str, int]:
     """Counts of samples by name of the status, from counts by code; without zeros."""
-    return {OUTCOMES[code].name: int(counts[code]) for code in np.flatnonzero(counts)}
+    codes = np.flatnonzero(counts)
+    return {OUTCOMES[code].name: int(counts[code]) for code in codes}

@@ -42,7 +42,8 @@ def fingerprint(value: Any) -> str:
     >>> fingerprint([1.0, "a"]) == fingerprint([1.0, "a"]) != fingerprint([2.0, "a"])
     True
     """
-    return hashlib.sha256(repr(_described(value, ())).encode()).hexdigest()
+    description = repr(_described(value, ()))
+    return hashlib.sha256(description.encode()).hexdigest()
 
 
 def _described(value: Any, inside: tuple[int, ...]) -> Any:
@@ -58,14 +59,11 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
     each = partial(_described, inside=(*inside, id(value)))
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
-        return (
-            name,
-            str(array.dtype),
-            array.shape,
-            np.ascontiguousarray(array).tobytes(),
-        )
+        data = np.ascontiguousarray(array).tobytes()
+        return name, str(array.dtype), array.shape, data
     if isinstance(value, Mapping):
-        return name, sorted(((each(k), each(x)) for k, x in value.items()), key=repr)
+        pairs = ((each(k), each(x)) for k, x in value.items())
+        return name, sorted(pairs, key=repr)
     if isinstance(value, list | tuple):
         return name, [each(x) for x in value]
     if isinstance(value, set | frozenset):
@@ -99,11 +97,8 @@ def _source(function: FunctionType) -> Any:
         return inspect.getsource(function)
     except (OSError, TypeError):
         code = function.__code__
-        return (
-            code.co_code,
-            code.co_names,
-            [x for x in code.co_consts if not inspect.iscode(x)],
-        )
+        constants = [x for x in code.co_consts if not inspect.iscode(x)]
+        return code.co_code, code.co_names, constants
 
 
 def _name(value: Any) -> str:
@@ -166,7 +161,8 @@ class Store:
         """Store a chunk."""
         buffer = io.BytesIO()
         np.savez(buffer, run=np.array(self.run), **chunk)  # type: ignore[arg-type]
-        _write(self.path(int(chunk["number"])), buffer.getvalue())
+        path = self.path(int(chunk["number"]))
+        _write(path, buffer.getvalue())
 
     def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
         """Statistics of chunk `number` from its file; None if it is missing or cannot
@@ -246,7 +242,8 @@ def _checked(path: Path, run: str) -> Chunk:
 
     zip checks the sums of their bytes.
     """
-    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+    data = io.BytesIO(path.read_bytes())
+    with np.load(data, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     owner = str(arrays.pop("run"))
     if owner != run:
@@ -256,7 +253,8 @@ def _checked(path: Path, run: str) -> Chunk:
 
 def _run(identity: dict[str, str]) -> str:
     """The hash of a run's identity."""
-    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+    text = json.dumps(identity, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _identity(folder: Path) -> dict[str, str]:

@@ -103,15 +103,18 @@ def added_error(fine: Chunk, coarse: Chunk) -> float:
     if not np.array_equal(fine["status"], coarse["status"]):
         return np.inf
     used = ~FAILURE[fine["status"]]
-    x, y = (chunk["velocity"][used].astype(float) for chunk in (fine, coarse))
-    pairs = [(x, y), ((x - x.mean(axis=0)) ** 2, (y - y.mean(axis=0)) ** 2)]
+    velocities = (chunk["velocity"][used] for chunk in (fine, coarse))
+    x, y = (velocity.astype(float) for velocity in velocities)
+    x_square = (x - x.mean(axis=0)) ** 2
+    y_square = (y - y.mean(axis=0)) ** 2
+    pairs = [(x, y), (x_square, y_square)]
     errors = []
     for exact, other in pairs:
         difference = other - exact
-        spread = difference.std(axis=0) / np.sqrt(max(len(x), 1))
+        count = max(len(x), 1)
+        spread = difference.std(axis=0) / np.sqrt(count)
         error = np.abs(difference.mean(axis=0)) + 2 * spread
         size = exact.std(axis=0)
-        errors.append(
-            np.where(error > 0, error / np.where(size > 0, size, 1e-300), 0.0)
-        )
+        relative = error / np.where(size > 0, size, 1e-300)
+        errors.append(np.where(error > 0, relative, 0.0))
     return float(np.max(errors))

@@ -37,9 +37,11 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     1
     """
     figure, axes = new_figure(4.2)
-    unit, size = readable_unit("s", max(float(h.duration) for h in histories.values()))
+    longest = max(float(h.duration) for h in histories.values())
+    unit, size = readable_unit("s", longest)
     for name, h in histories.items():
-        axes.plot(np.asarray(h.time) / size, h.force[:, contact], label=name)
+        time = np.asarray(h.time) / size
+        axes.plot(time, h.force[:, contact], label=name)
     axes.set(xlabel=f"impact time [{unit}]", ylabel="force [N]")
     axes.set_ylim(bottom=0)
     axes.legend()
@@ -75,7 +77,8 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     touching = np.flatnonzero(force > 0)
     # to the first state without force
     until = slice(0, touching[-1] + 2 if len(touching) else 1)
-    unit, size = readable_unit("m", float(np.max(np.abs(result.approach[:, contact]))))
+    deepest = np.max(np.abs(result.approach[:, contact]))
+    unit, size = readable_unit("m", float(deepest))
     x = np.asarray(result.approach[until, contact]) / size
     force = force[until]
     figure, axes = new_figure(4.4, title)
@@ -87,13 +90,16 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     else:
         turns = np.zeros(0, int)
     names = [f"{'MR'[i % 2]}{i // 2 + 1}" for i in range(len(turns))]
-    for name, i in zip(["O", *names, "B"], [0, *turns, len(x) - 1], strict=True):
+    corners = ["O", *names, "B"]
+    states = [0, *turns, len(x) - 1]
+    for name, i in zip(corners, states, strict=True):
         if name[0] == "R":
             above = (0, -10)
         else:
             above = (0, 10)
-        axes.plot(x[i], force[i], "o", color="black", ms=4)
-        write(axes, (x[i], force[i]), name, xytext=above, textcoords="offset points")
+        point = (x[i], force[i])
+        axes.plot(*point, "o", color="black", ms=4)
+        write(axes, point, name, xytext=above, textcoords="offset points")
     axes.margins(y=0.12)
     axes.set(xlabel=f"approach of the bodies [{unit}]", ylabel="force [N]")
     return figure
@@ -137,14 +143,15 @@ def history(result: History, title: str = "") -> Figure:
         "stored energy [J]": result.energy,
     }
     for axes, (label, values) in zip(panels, rows.items(), strict=True):
-        axes.plot(time, values, label=[f"contact {j + 1}" for j in range(contacts)])
+        labels = [f"contact {j + 1}" for j in range(contacts)]
+        axes.plot(time, values, label=labels)
         axes.set_ylabel(label)
     for j, y in enumerate(np.asarray(result.tangential_force).T):
         colour = colour_of(j * contacts // result.tangential_force.shape[1])
-        panels[0].plot(
-            time, y, "--", color=colour, label="tangential" if j == 0 else None
-        )
+        name = "tangential" if j == 0 else None
+        panels[0].plot(time, y, "--", color=colour, label=name)
     panels[1].axhline(0, color=GREY, lw=0.8)
     panels[-1].set_xlabel(f"impact time [{unit}]")
-    legend_below(figure, 5, panels[0].get_legend_handles_labels()[0][: len(COLOURS)])
+    handles = panels[0].get_legend_handles_labels()[0]
+    legend_below(figure, 5, handles[: len(COLOURS)])
     return figure

@@ -79,7 +79,8 @@ def colour_of(i: int) -> str:
 def by_code(colours: tuple[str, ...]) -> dict[str, Any]:
     """Options of an image whose values are whole numbers, the code of a colour each."""
     edges = np.arange(len(colours) + 1) - 0.5
-    return {"cmap": ListedColormap(colours), "norm": BoundaryNorm(edges, len(colours))}
+    norm = BoundaryNorm(edges, len(colours))
+    return {"cmap": ListedColormap(colours), "norm": norm}
 
 
 def new_figure(
@@ -100,9 +101,8 @@ def new_panels(
     """A figure of `count` panels, two side by side; a row is `height` [in] high."""
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
-    figure, panels = new_figure(
-        more + height * rows, title, rows, columns, squeeze=False, **shared
-    )
+    total = more + height * rows
+    figure, panels = new_figure(total, title, rows, columns, squeeze=False, **shared)
     for spare in panels.ravel()[count:]:
         spare.remove()
     return figure, panels.ravel()[:count]
@@ -125,16 +125,16 @@ def velocities_by_unit(scene: Scene, names: Sequence[str]) -> dict[str, list[Vel
             f"Argument `names` must have {n} names, one a velocity, but has {names}."
         )
     if not names and scene.walls is not None:
-        return {f"{label} [m/s]": [(i, f"body {i + 1}", 1.0) for i in range(n)]}
+        bodies = [(i, f"body {i + 1}", 1.0) for i in range(n)]
+        return {f"{label} [m/s]": bodies}
     if not names:
         root = np.sqrt(np.diag(dense_mass(scene))).tolist()
         each = [(i, f"coordinate {i + 1}", root[i]) for i in range(n)]
         return {f"{label} · √inertia [√J]": each}
     by_unit: dict[str, list[Velocity]] = {}
     for i, (word, unit) in enumerate(map(split_name, names)):
-        by_unit.setdefault(f"{label} [{unit}]" if unit else label, []).append(
-            (i, word, 1.0)
-        )
+        panel = f"{label} [{unit}]" if unit else label
+        by_unit.setdefault(panel, []).append((i, word, 1.0))
     return by_unit
 
 
@@ -150,7 +150,8 @@ def panels_of_laws(
     units = velocities_by_unit(scene, names)
     heights = [2.6] * len(units) + [lowest]
     grid: Any = {"sharex": True, "height_ratios": heights}
-    figure, panels = new_figure(sum(heights) + 2.2, title, len(heights), 1, **grid)
+    total = sum(heights) + 2.2
+    figure, panels = new_figure(total, title, len(heights), 1, **grid)
     for axes, label in zip(panels, units):
         axes.set_ylabel(label)
     for axes in panels:
@@ -162,16 +163,19 @@ def panels_of_laws(
     else:
         words = [law.replace(", ", ",\n").replace("_", "\n") for law in laws]
     at = range(len(laws))
-    panels[-1].set_xticks(at, words, fontsize=SMALL, rotation=90 if many else 0)
+    angle = 90 if many else 0
+    panels[-1].set_xticks(at, words, fontsize=SMALL, rotation=angle)
     panels[-1].set_xlabel("law")
-    return figure, list(zip(panels, units.values())), panels[-1]
+    of_units = list(zip(panels, units.values()))
+    return figure, of_units, panels[-1]
 
 
 def side_by_side(bodies: int) -> np.ndarray:
     """Offsets (bodies,) on the x axis of the bodies of one group: evenly over `SPREAD`,
     mean 0.
     """
-    return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
+    place = np.arange(bodies) - (bodies - 1) / 2
+    return place * SPREAD / bodies
 
 
 def legend_below(
@@ -189,10 +193,8 @@ def legend_below(
         handles = [first[label] for label in dict.fromkeys(label for _, label in pairs)]
     entries = list(handles)
     if entries:
-        place: Any = {
-            "loc": "outside lower center",
-            "ncols": min(columns, len(entries)),
-        }
+        most = min(columns, len(entries))
+        place: Any = {"loc": "outside lower center", "ncols": most}
         figure.legend(handles=entries, title=note or None, **place)
 
 
@@ -218,7 +220,8 @@ def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
     lowest_first = sorted(ends, key=lambda end: end.at[1])
     texts = []
     for axes, at, name, colour in lowest_first:
-        text = axes.annotate(name, at, xytext=(5, 0), color=colour, zorder=5, **place)
+        style = place | {"color": colour, "zorder": 5}
+        text = axes.annotate(name, at, xytext=(5, 0), **style)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         texts.append(text)
     figure.draw_without_rendering()  # the layout decides where points are on the page
@@ -226,10 +229,12 @@ def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
     for text in texts:
         box = text.get_window_extent()
         up = 0.0
-        while any(box.translated(0, up).overlaps(other) for other in boxes):
+        moved = box
+        while any(moved.overlaps(other) for other in boxes):
             up += box.height / 4
+            moved = box.translated(0, up)
         text.xyann = (5, up * 72 / figure.dpi)
-        boxes.append(box.translated(0, up))
+        boxes.append(moved)
 
 
 def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
@@ -252,7 +257,8 @@ def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
 def write(axes: Axes, at: Any, text: str, **style: Any) -> None:
     """Write a small text, centred at a point (2,)."""
     centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
-    axes.annotate(text, (at[0], at[1]), **centred | style)
+    point = (at[0], at[1])
+    axes.annotate(text, point, **centred | style)
 
 
 def logarithmic(axes: Axes, which: str) -> None:
@@ -264,9 +270,8 @@ def logarithmic(axes: Axes, which: str) -> None:
         axis.set_major_locator(MaxNLocator(4))
     else:
         few = high / low < _DECADES
-        axis.set_major_locator(
-            LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7)
-        )
+        digits = (1.0, 2.0, 5.0) if few else (1.0,)
+        axis.set_major_locator(LogLocator(subs=digits, numticks=7))
     axis.set_major_formatter(
         FuncFormatter(lambda x, _: _tick(x, *axis.get_view_interval()))
     )
@@ -292,7 +297,8 @@ def in_words(x: float) -> str:
 
 def as_power(x: float) -> str:
     """A number as a factor, unless it is 1, and a power of ten."""
-    power = int(np.floor(np.log10(abs(x)) + 1e-9))
+    magnitude = np.log10(abs(x)) + 1e-9
+    power = int(np.floor(magnitude))
     factor = x / 10.0**power
     if abs(factor - 1) < 1e-6:
         head = ""

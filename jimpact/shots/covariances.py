@@ -54,9 +54,8 @@ def as_covariance(
     check_values("covariance", array)
     blocks = diagonal_blocks(array, 2 * n)
     for k, block in enumerate(blocks):
-        _check_positive(
-            block, f" in shot {k + 1}", exact=np.arange(2 * n) < n, least=ROUNDING
-        )
+        before = np.arange(2 * n) < n
+        _check_positive(block, f" in shot {k + 1}", exact=before, least=ROUNDING)
     if array.ndim == 2:
         exact = np.tile(np.arange(2 * n) < n, count)
         _check_positive(array, " of all shots", exact, least=-ROUNDING)
@@ -83,13 +82,16 @@ def _check_positive(
     must = "Argument `covariance` must be"
     variance = np.diagonal(matrix)
     sizes = np.sqrt(np.abs(np.outer(variance, variance)))
-    if not (np.abs(matrix - matrix.T) <= ROUNDING * sizes).all():
+    difference = np.abs(matrix - matrix.T)
+    if not (difference <= ROUNDING * sizes).all():
         raise ValueError(f"{must} symmetric, but is not{where}.")
-    uncertain = ~((variance == 0) & exact & ~matrix.any(axis=1))
+    unused = (variance == 0) & exact & ~matrix.any(axis=1)
+    uncertain = ~unused
     if not (variance[uncertain] > 0).all():
         raise ValueError(f"{must} positive definite, but has a variance <= 0{where}.")
     block = np.ix_(uncertain, uncertain)
-    lowest = np.linalg.eigvalsh(matrix[block] / sizes[block])[0]
+    correlation = matrix[block] / sizes[block]
+    lowest = np.linalg.eigvalsh(correlation)[0]
     if lowest < least:
         raise ValueError(
             f"{must} positive definite, but its correlation has the eigenvalue "
@@ -105,9 +107,9 @@ def diagonal_blocks(covariance: Any, size: int) -> Float[np.ndarray, "K N N"]:
     if array.ndim == 3:
         return array
     count = len(array) // size
-    return array.reshape(count, size, count, size)[
-        np.arange(count), :, np.arange(count)
-    ]
+    shot = np.arange(count)
+    by_shots = array.reshape(count, size, count, size)
+    return by_shots[shot, :, shot]
 
 
 def covariance_of(
@@ -119,7 +121,8 @@ def covariance_of(
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array[shots]
-    rows = (2 * n * np.asarray(shots)[:, None] + np.arange(2 * n)).ravel()
+    first = 2 * n * np.asarray(shots)[:, None]
+    rows = (first + np.arange(2 * n)).ravel()
     return array[np.ix_(rows, rows)]
 
 
@@ -173,16 +176,18 @@ def whitening(
         rows = used.reshape(1, -1)
     size = rows.shape[1]  # of one matrix for each shot, or of one for all
     matrices = covariance.reshape(-1, size, size)
-    matrices = np.where(rows[:, :, None] & rows[:, None, :], matrices, np.eye(size))
-    errors = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    both = rows[:, :, None] & rows[:, None, :]
+    matrices = np.where(both, matrices, np.eye(size))
+    variances = np.diagonal(matrices, axis1=1, axis2=2)
+    errors = np.sqrt(variances)
     try:
-        factor = np.linalg.cholesky(
-            matrices / (errors[:, :, None] * errors[:, None, :])
-        )
+        sizes = errors[:, :, None] * errors[:, None, :]
+        factor = np.linalg.cholesky(matrices / sizes)
     except np.linalg.LinAlgError:
         raise ValueError(
             "Argument `covariance` must leave an error in each velocity after an "
             "impact that the law predicts from those before, but is singular there: "
             "are shots in it twice?"
         ) from None
-    return errors.reshape(used.shape), np.linalg.inv(factor).reshape(covariance.shape)
+    inverse = np.linalg.inv(factor)
+    return errors.reshape(used.shape), inverse.reshape(covariance.shape)

@@ -127,7 +127,8 @@ class Experiments(eqx.Module):
             self.covariance = as_covariance(covariance, measured.shape)
             blocks = diagonal_blocks(self.covariance, 2 * measured.shape[1])
             variances = blocks.diagonal(axis1=1, axis2=2)
-            sigma_pre, sigma = np.split(np.sqrt(variances), 2, axis=1)
+            deviations = np.sqrt(variances)
+            sigma_pre, sigma = np.split(deviations, 2, axis=1)
         self.sigma = _as_sigma("sigma", sigma, measured)
         self.resolution = _as_sigma("resolution", resolution, measured)
         self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, zero=True)
@@ -146,15 +147,15 @@ class Experiments(eqx.Module):
             self.scenes = None
         else:
             self.scenes = _as_scenes(scenes, self.pre.shape)
-        self.shots = tuple(
-            map(str, range(1, len(measured) + 1) if shots is None else shots)
-        )
+        labels = range(1, len(measured) + 1) if shots is None else shots
+        self.shots = tuple(map(str, labels))
         if len(self.shots) != len(measured):
             raise ValueError(
                 f"Argument `shots` must have {len(measured)} labels, one per shot, "
                 f"but has {len(self.shots)}."
             )
-        self.lost = tuple(np.broadcast_to(lost_freedom, len(measured)).tolist())
+        of_shots = np.broadcast_to(lost_freedom, len(measured))
+        self.lost = tuple(of_shots.tolist())
         n = measured.shape[1]
         if units is None:
             units = LINEAR
@@ -162,7 +163,8 @@ class Experiments(eqx.Module):
             self.units = (units,) * n
         else:
             self.units = tuple(units)
-        if len(self.units) != n or not set(self.units) <= {LINEAR, ANGULAR}:
+        known = set(self.units) <= {LINEAR, ANGULAR}
+        if len(self.units) != n or not known:
             raise ValueError(
                 f"Argument `units` must have {n} entries, each '{LINEAR}' or "
                 f"'{ANGULAR}', but has value {units!r}: convert velocities to these (1 "
@@ -224,7 +226,8 @@ class Experiments(eqx.Module):
         """The first of the scenes (or the given common scene) with the most
         contacts.
         """
-        return max(self.each(scene, lambda each: each), key=lambda each: each.contacts)
+        scenes = self.each(scene, lambda each: each)
+        return max(scenes, key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N
@@ -240,7 +243,8 @@ class Experiments(eqx.Module):
         >>> round(float(data.momentum_excess(ji.chain([1.0, 1.0]))[0, 0]), 6)
         0.1
         """
-        return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
+        balances = self.balances(scene)
+        return _filled([m @ (post - pre) for m, pre, post in balances])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`C^T M v+ / C^T M v-` (K, c) in a scene, see `momentum_excess`; inf or NaN
@@ -251,9 +255,8 @@ class Experiments(eqx.Module):
             for m, pre, post in self.balances(scene):
                 before = m @ pre
                 rounding = 1e-12 * np.abs(m) @ np.abs(pre)
-                rows.append(
-                    (m @ post) / np.where(np.abs(before) > rounding, before, 0.0)
-                )
+                some = np.abs(before) > rounding
+                rows.append((m @ post) / np.where(some, before, 0.0))
         return _filled(rows)
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
@@ -262,9 +265,8 @@ class Experiments(eqx.Module):
         """
         masses = np.array(self.each(scene, dense_mass))
         both = (self.pre, self.post)
-        before, after = (
-            np.einsum("ki,kij,kj->k", v, masses, v) for v in map(np.asarray, both)
-        )
+        velocities = map(np.asarray, both)
+        before, after = (np.einsum("ki,kij,kj->k", v, masses, v) for v in velocities)
         return after / np.where(before > 0, before, np.nan)
 
     def momentum_corrected(self, scene: Scene | None = None) -> "Experiments":
@@ -286,10 +288,12 @@ class Experiments(eqx.Module):
         corrected = np.array(self.post, dtype=float)
         lost = list(self.lost)
         after = _after(self)
-        for k, (m, pre, post) in enumerate(self.balances(scene)):
+        balances = self.balances(scene)
+        for k, (m, pre, post) in enumerate(balances):
             if len(m) == 0 or np.isnan(post).any():
                 continue
-            corrected[k] -= _smallest_change(after[k], m) @ (m @ (post - pre))
+            excess = m @ (post - pre)
+            corrected[k] -= _smallest_change(after[k], m) @ excess
             lost[k] += len(m)
         return self._with(post=corrected, lost_freedom=lost)
 
@@ -323,7 +327,8 @@ class Experiments(eqx.Module):
         """The shots whose scenes have one of these numbers of contacts."""
         chosen = np.isin(self.contacts, contacts)
         if not chosen.any():
-            numbers = ", ".join(map(str, sorted(set(self.contacts))))
+            known = sorted(set(self.contacts))
+            numbers = ", ".join(map(str, known))
             raise ValueError(
                 f"`contacts` in [data] must be one of {numbers}, but is {contacts}."
             )
@@ -377,13 +382,13 @@ class Experiments(eqx.Module):
             raise ValueError(
                 "Argument `many` must hold at least one data set, but is empty."
             )
+        units = [data.units for data in many]
+        without_errors = [data.sigma is None for data in many]
+        without_scenes = [data.scenes is None for data in many]
         for name, same in (
-            ("as many bodies and the same units", [data.units for data in many]),
-            (
-                "a `sigma` (or `resolution`) in all or in none",
-                [d.sigma is None for d in many],
-            ),
-            ("scenes of their own in all or in none", [d.scenes is None for d in many]),
+            ("as many bodies and the same units", units),
+            ("a `sigma` (or `resolution`) in all or in none", without_errors),
+            ("scenes of their own in all or in none", without_scenes),
         ):
             if len(set(same)) > 1:
                 raise ValueError(f"Argument `many` must have {name}.")
@@ -421,13 +426,15 @@ class Experiments(eqx.Module):
         """
         if self.covariance is not None or self.sigma is None:
             return self.covariance
-        after = np.where(self.measured, np.asarray(self.sigma, float), 1.0)
+        sigma = np.asarray(self.sigma, float)
+        after = np.where(self.measured, sigma, 1.0)
         if self.sigma_pre is None:
             before = np.zeros_like(after)
         else:
             before = np.asarray(self.sigma_pre)
         errors = np.hstack([before, after])
-        return errors[:, :, None] ** 2 * np.eye(errors.shape[1])
+        variances = errors[:, :, None] ** 2
+        return variances * np.eye(errors.shape[1])
 
     @property
     def contacts(self) -> np.ndarray:
@@ -444,8 +451,10 @@ class Experiments(eqx.Module):
         0.75
         """
         normals = self.each(scene, closed_normals)
-        rates = [n.T @ v for n, v in zip(normals, np.asarray(self.pre, float))]
-        return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
+        velocities = np.asarray(self.pre, float)
+        rates = [n.T @ v for n, v in zip(normals, velocities)]
+        approaches = (-gamma.min(initial=0.0) for gamma in rates)
+        return np.array([max(approach, 0.0) for approach in approaches])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
         """Errors (n,) of equal weight in a scene: 1 m/s, and those rad/s of as much
@@ -457,12 +466,10 @@ class Experiments(eqx.Module):
         turns = np.array(self.units) == ANGULAR
         if turns.all() or not turns.any():
             return np.ones(len(turns))
-        masses = np.mean(
-            [np.diag(mass) for mass in self.each(scene, dense_mass)], axis=0
-        )
-        return np.where(
-            turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0
-        )
+        diagonals = [np.diag(mass) for mass in self.each(scene, dense_mass)]
+        masses = np.mean(diagonals, axis=0)
+        arm = np.sqrt(masses[~turns].mean() / masses[turns].mean())
+        return np.where(turns, arm, 1.0)
 
     def balances(
         self, scene: Scene | None
@@ -472,10 +479,8 @@ class Experiments(eqx.Module):
         """
         pre = np.asarray(self.pre, float)
         post = np.asarray(self.post, float)
-        return [
-            (rows, a, b)
-            for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)
-        ]
+        rows = self.each(scene, conserved_momenta)
+        return list(zip(rows, pre, post))
 
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
         """K values `function(scene)` of the scenes of the shots; once for a scene they
@@ -523,11 +528,15 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
 
     Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S the covariance of v+.
     """
-    kept = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1))
+    identity = np.eye(data.pre.shape[1])
+    kept = np.tile(identity, (len(data.shots), 1, 1))
     after = _after(data)
-    for k, (m, pre, post) in enumerate(data.balances(scene)):
-        rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
-        if 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all():
+    balances = data.balances(scene)
+    for k, (m, pre, post) in enumerate(balances):
+        speeds = np.abs(pre) + np.abs(post)
+        rounding = ROUNDING * np.abs(m) @ speeds
+        conserved = (np.abs(m @ (post - pre)) <= rounding).all()
+        if 0 < len(m) <= data.lost[k] and conserved:
             kept[k] -= _smallest_change(after[k], m) @ m
     return kept
 
@@ -535,7 +544,8 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
 def _filled(rows: list[np.ndarray]) -> np.ndarray:
     """Rows of different lengths as an array (K, c), with NaN behind shorter ones."""
     columns = list(zip_longest(*rows, fillvalue=np.nan))
-    return np.array(columns, float).reshape(-1, len(rows)).T
+    filled = np.array(columns, float)
+    return filled.reshape(-1, len(rows)).T
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:
@@ -544,26 +554,32 @@ def conserved_momenta(scene: Scene) -> np.ndarray:
 
     Each column of C is scaled to a largest entry of 1.
     """
-    others = [x for x in (scene.tangents, scene.constraints) if x is not None]
-    forces = np.hstack([np.asarray(x, float) for x in (scene.normals, *others)])
+    all_others = (scene.tangents, scene.constraints)
+    others = [x for x in all_others if x is not None]
+    directions = (scene.normals, *others)
+    forces = np.hstack([np.asarray(x, float) for x in directions])
     u, singular, _ = np.linalg.svd(forces)
-    rank = int((singular > singular[0] * max(forces.shape) * np.finfo(float).eps).sum())
+    rounding = singular[0] * max(forces.shape) * np.finfo(float).eps
+    rank = int((singular > rounding).sum())
     complement = u[:, rank:]
-    largest = np.argmax(np.abs(complement).round(12), axis=0)  # the first of equal ones
-    return (
-        complement / complement[largest, np.arange(complement.shape[1])]
-    ).T @ dense_mass(scene)
+    size = np.abs(complement).round(12)
+    largest = np.argmax(size, axis=0)  # the first of equal ones
+    column = np.arange(complement.shape[1])
+    scaled = complement / complement[largest, column]
+    return scaled.T @ dense_mass(scene)
 
 
 def closed_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the closed contacts."""
-    return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
+    normals = np.asarray(scene.normals, float)
+    return normals[:, np.asarray(scene.closed)]
 
 
 def possible_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the contacts that are closed, or have a gap that may close."""
     possible = scene.closed if scene.gaps is None else np.isfinite(scene.gaps)
-    return np.asarray(scene.normals, float)[:, np.asarray(possible)]
+    normals = np.asarray(scene.normals, float)
+    return normals[:, np.asarray(possible)]
 
 
 def _check_alone(given: str, others: dict[str, Any]) -> None:
@@ -608,9 +624,8 @@ def _as_sigma(
             f"`post`, but has shape {tuple(sigma.shape)}."
         )
     # the error of a value that was not measured does not matter
-    check_values(
-        name, np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=not zero
-    )
+    known = np.where(measured, np.asarray(sigma), 1.0)
+    check_values(name, known, low=0.0, open_low=not zero)
     return jnp.where(measured, sigma, jnp.nan)
 
 
@@ -717,5 +732,7 @@ def _scenes_of(
     gaps = values.get("gap", [place.gaps] * count)
     if "mass" not in values:
         return [with_gaps(place, as_float_array("gaps", gap)) for gap in gaps]
-    wall: Any = next(name for name, sides in WALLS.items() if sides == place.walls)
-    return [chain(mass, wall, gap) for mass, gap in zip(values["mass"], gaps)]
+    with_walls = (name for name, sides in WALLS.items() if sides == place.walls)
+    wall: Any = next(with_walls)
+    masses_and_gaps = zip(values["mass"], gaps)
+    return [chain(mass, wall, gap) for mass, gap in masses_and_gaps]

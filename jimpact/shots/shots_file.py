@@ -74,7 +74,8 @@ def read_shots(path: str | Path) -> ShotTable:
     labels = [i for i, column in enumerate(columns) if column.kind == "shot"]
     shots = [row[i] or str(k + 1) for i in labels for k, (_, row) in enumerate(rows)]
     units = {column.body: column.unit for column in columns if column.kind == "pre"}
-    return ShotTable(values, [units[i + 1] for i in range(len(units))], shots or None)
+    in_order = [units[i + 1] for i in range(len(units))]
+    return ShotTable(values, in_order, shots or None)
 
 
 class Positions(NamedTuple):
@@ -101,18 +102,22 @@ def read_positions(path: str | Path) -> Positions:
         for kind in ("q", "sigma_q")
         if kind == "q" or any(k == kind for k, _ in keys)
     ]
-    required = [("t", 1), *((kind, i + 1) for kind in kinds for i in range(size))]
+    of_bodies = ((kind, i + 1) for kind in kinds for i in range(size))
+    required = [("t", 1), *of_bodies]
     if sorted(keys) != sorted(required):
         raise ValueError(
             f"{where}: the columns must be "
             f"{', '.join(f'`{k}_{i}`' for k, i in required[1:])} and `t`, each once, "
             f"but are {', '.join(c.header for c in columns)}."
         )
-    values = _values(columns, rows, dict.fromkeys(("t", *kinds), size))
+    counts = dict.fromkeys(("t", *kinds), size)
+    values = _values(columns, rows, counts)
     time = values["t"][:, 0]
     at = keys.index(("t", 1))
-    rounding = max(_last_digit(cells[at]) for _, cells in rows) * columns[at].factor
-    return Positions(_even(where, time, rounding), values["q"], values.get("sigma_q"))
+    last_digit = max(_last_digit(cells[at]) for _, cells in rows)
+    rounding = last_digit * columns[at].factor
+    even = _even(where, time, rounding)
+    return Positions(even, values["q"], values.get("sigma_q"))
 
 
 def _last_digit(cell: str) -> float:
@@ -120,7 +125,8 @@ def _last_digit(cell: str) -> float:
     '0.033'.
     """
     mantissa, _, power = cell.lower().partition("e")
-    return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
+    decimals = len(mantissa.partition(".")[2])
+    return float(10.0 ** (int(power or 0) - decimals))
 
 
 def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
@@ -135,9 +141,11 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
     Raises:
         ValueError: times that do not rise, or in unequal steps.
     """
-    if len(time) < 2 or not (np.diff(time) > 0).all():
+    rises = np.diff(time) > 0
+    if len(time) < 2 or not rises.all():
         raise ValueError(f"{where}: the times `t` must be two or more, and rise.")
-    step = (time[-1] - time[0]) / (len(time) - 1)
+    duration = time[-1] - time[0]
+    step = duration / (len(time) - 1)
     even = time[0] + step * np.arange(len(time))
     off = np.abs(time - even)
     # each end and the time between may be off by half of the last digit
@@ -151,7 +159,8 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
             f"{time[k]:g} s is {off[k]:.2g} s off steps of {step:.6g} s; as they are "
             f"written they may be {allowed:.2g} s off."
         )
-    slope, start = np.polyfit(np.arange(len(time)), time, 1)
+    number = np.arange(len(time))
+    slope, start = np.polyfit(number, time, 1)
     return np.asarray(start + slope * np.arange(len(time)))
 
 
@@ -198,7 +207,8 @@ def _read(
                 f"{line}: a {what} must have {len(headers)} values, one per column, "
                 f"but has {len(row)} ({_HOW})."
             )
-    return where, columns, [(line, [row[i] for i in read]) for line, row in rows[1:]]
+    below = [(line, [row[i] for i in read]) for line, row in rows[1:]]
+    return where, columns, below
 
 
 class CsvColumn(NamedTuple):
@@ -266,7 +276,8 @@ def _column(
         base = ANGULAR
     else:
         base = LINEAR
-    return CsvColumn(header, kind, int(body or 1), units[unit.strip()], base)
+    number = int(body or 1)
+    return CsvColumn(header, kind, number, units[unit.strip()], base)
 
 
 def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
@@ -274,7 +285,8 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
     ones.
     """
     keys = [(c.kind, c.body) for c in columns]
-    velocities = [c for c in columns if c.kind in (*_NEEDED, *_ERRORS)]
+    of_velocities = (*_NEEDED, *_ERRORS)
+    velocities = [c for c in columns if c.kind in of_velocities]
     for column, key in zip(columns, keys):
         if keys.count(key) > 1:
             raise ValueError(
@@ -286,9 +298,8 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
                 f"{where}: all columns of velocity {column.body} must be in m/s or all "
                 f"in rad/s, but some are in each."
             )
-    kinds = [
-        kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)
-    ]
+    given = {kind for kind, _ in keys}
+    kinds = [kind for kind in _KINDS if kind in _NEEDED or kind in given]
     if velocities:
         bodies = max(1, *(c.body for c in velocities))
     else:
@@ -300,8 +311,9 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
         for kind in kinds
     }
     # of every kind, columns 1 to its count
+    bodies_at_most = max(counts.values())
     required = [
-        (i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]
+        (i + 1, k) for i in range(bodies_at_most) for k in kinds if i < counts[k]
     ]
     missing = [f"{kind}_{i}" for i, kind in required if (kind, i) not in keys]
     if missing:
@@ -321,14 +333,16 @@ def _values(
 
     A warning reports cells with the text NaN.
     """
-    values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
+    count = len(rows)
+    values = {kind: np.full((count, n), np.nan) for kind, n in counts.items()}
     not_numbers = []
     for k, (line, row) in enumerate(rows):
         for column, cell in zip(columns, row):
             if column.kind == "shot":
                 continue
             where = f"{line}, column `{column.header}`"
-            values[column.kind][k, column.body - 1] = _number(where, column, cell)
+            number = _number(where, column, cell)
+            values[column.kind][k, column.body - 1] = number
             if _is_nan(cell):
                 not_numbers.append(where)
         for column in columns:

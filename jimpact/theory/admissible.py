@@ -59,7 +59,8 @@ class AdmissibleSet:
         """v+ (n,) [m/s] of least energy: every contact that carries an impulse remains
         closed.
         """
-        return self._velocity(self.coordinates.project(np.zeros(self.dimension)))
+        origin = np.zeros(self.dimension)
+        return self._velocity(self.coordinates.project(origin))
 
     @property
     def least_energy(self) -> float:
@@ -79,7 +80,8 @@ class AdmissibleSet:
             [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)]
             for c in self.axes
         ]
-        return np.array([[low[i], high[i]] for i, (low, high) in enumerate(ends)])
+        extremes = enumerate(ends)
+        return np.array([[low[i], high[i]] for i, (low, high) in extremes])
 
     def contains(
         self, velocity: Any, tolerance: float | None = None
@@ -94,7 +96,8 @@ class AdmissibleSet:
         largest |u|; None: that of `audit`.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)
-        if v.ndim not in (1, 2) or v.shape[-1] != self.scene.size:
+        is_row_or_rows = v.ndim in (1, 2)
+        if not is_row_or_rows or v.shape[-1] != self.scene.size:
             raise ValueError(
                 f"Argument `velocity` must have shape ({self.scene.size},) or "
                 f"(k, {self.scene.size}), but has shape {v.shape}."
@@ -110,7 +113,8 @@ class AdmissibleSet:
         u = offset @ mass @ self.axes
         w = offset - u @ self.axes.T  # violates the momentum balance
         square = np.einsum("...i,ij,...j->...", w, mass, w)
-        error = np.maximum(self.coordinates.excess(u), np.sqrt(np.maximum(square, 0.0)))
+        violation = np.sqrt(np.maximum(square, 0.0))
+        error = np.maximum(self.coordinates.excess(u), violation)
         inside = error <= allowed * self._size
         if v.ndim == 1:
             return bool(inside)
@@ -126,9 +130,9 @@ class AdmissibleSet:
         as_whole("count", count, 1)
         if self.dimension == 0:
             return np.repeat(self.centre[None], count, axis=0)
-        return self._velocity(
-            self.coordinates.sample(np.random.default_rng(seed), count)
-        )
+        generator = np.random.default_rng(seed)
+        points = self.coordinates.sample(generator, count)
+        return self._velocity(points)
 
     def conserving_arc(self, points: int = 100) -> np.ndarray:
         """Outcomes v+ with T+ = T- of two contacts: an arc (points, n) [m/s] from A to
@@ -146,8 +150,10 @@ class AdmissibleSet:
         ends = self.coordinates.arc()
         if ends is None:
             return np.zeros((0, self.scene.size))
-        arc = self._velocity(self.coordinates.on_circle(np.linspace(*ends, points)))
-        first = np.asarray(self.scene.normals)[:, int(np.argmax(self.scene.closed))]
+        angles = np.linspace(*ends, points)
+        arc = self._velocity(self.coordinates.on_circle(angles))
+        contact = int(np.argmax(self.scene.closed))
+        first = np.asarray(self.scene.normals)[:, contact]
         if arc[0] @ first > arc[-1] @ first:
             return arc[::-1]
         return arc
@@ -171,12 +177,14 @@ class AdmissibleSet:
         [m/s].
         """
         closed = np.asarray(self.scene.closed)
-        approaching = np.asarray(gap_velocity(self.scene, self.velocity))[closed] < 0
+        gamma = gap_velocity(self.scene, self.velocity)
+        approaching = np.asarray(gamma)[closed] < 0
         head = (
             f"closed contacts: {int(closed.sum())}, approaching: "
             f"{int(approaching.sum())};"
         )
-        smallest = _ZERO * max(1e-300, float(np.abs(self.velocity).max()))
+        fastest = float(np.abs(self.velocity).max())
+        smallest = _ZERO * max(1e-300, fastest)
 
         def show(x: float, width: int = 0) -> str:
             """A velocity [m/s] with six digits; 0 within rounding."""
@@ -195,11 +203,11 @@ class AdmissibleSet:
             ),
             "coordinate          v-         least       plastic      greatest   [m/s]",
         ]
-        columns = zip(self.velocity, self.bounds[:, 0], self.plastic, self.bounds[:, 1])
+        least, greatest = self.bounds.T
+        columns = zip(self.velocity, least, self.plastic, greatest)
         for i, (before, *after) in enumerate(columns):
-            lines.append(
-                f"{i + 1:10d}{show(before, 12)}" + "".join(show(x, 14) for x in after)
-            )
+            results = "".join(show(x, 14) for x in after)
+            lines.append(f"{i + 1:10d}{show(before, 12)}" + results)
         if self.dimension == 2:
             for name, v in zip("AB", self.conserving_arc(2)):
                 lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
@@ -266,20 +274,25 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     y = root.T @ start
     free = _constraint_projector(scene, root, y, tolerance)
     # one column for each closed contact: qn = unit^T y, its normal in the coordinates y
-    unit = np.linalg.solve(root, np.asarray(scene.normals, float)[:, closed])
+    normals = np.asarray(scene.normals, float)[:, closed]
+    unit = np.linalg.solve(root, normals)
     unit = unit / np.linalg.norm(unit, axis=0)
-    approach = unit.T @ y < -_APPROACH * np.finfo(
-        scene.mass.dtype
-    ).eps * np.linalg.norm(y)
+    size = np.linalg.norm(y)
+    rounding = _APPROACH * np.finfo(scene.mass.dtype).eps
+    approach = unit.T @ y < -rounding * size
     energy = 0.5 * float(y @ y)
     outcomes = partial(AdmissibleSet, scene, start, energy=energy, tolerance=tolerance)
     if not approach.any():
-        alone = CappedPolyhedron(np.zeros((0, 0)), np.zeros(0), 0.0)
-        return outcomes(centre=start, axes=np.zeros((len(start), 0)), coordinates=alone)
+        no_rows = np.zeros((0, 0))
+        alone = CappedPolyhedron(no_rows, np.zeros(0), 0.0)
+        no_axes = np.zeros((len(start), 0))
+        return outcomes(centre=start, axes=no_axes, coordinates=alone)
     unit = free @ unit
-    floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * unit.shape[1]
+    rounding = _SINGULAR * np.finfo(scene.mass.dtype).eps
+    floor = rounding * unit.shape[1]
     # not contacts that constraints hold
-    unit = unit[:, np.sum(unit**2, axis=0) > floor]
+    square = np.sum(unit**2, axis=0)
+    unit = unit[:, square > floor]
     basis, singular, _ = np.linalg.svd(unit, full_matrices=False)
     basis = basis[:, singular**2 > floor]
     normal = basis.T @ unit  # contacts in the coordinates z = basis^T y
@@ -288,11 +301,11 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     # - z-) >= 0
     facets = cone_facets(normal)
     rows = np.vstack([normal.T, facets])
-    offset = np.append(np.zeros(normal.shape[1]), facets @ before)
+    of_contacts = np.zeros(normal.shape[1])
+    offset = np.append(of_contacts, facets @ before)
     redundant = basis.shape[1] < unit.shape[1]
-    part, centre, axes = capped_polyhedron(
-        rows, offset, float(np.linalg.norm(before)), redundant
-    )
+    radius = float(np.linalg.norm(before))
+    part, centre, axes = capped_polyhedron(rows, offset, radius, redundant)
     rest = y - basis @ before + basis @ centre  # impulses leave y - basis z- as it is
     centre = np.linalg.solve(root.T, rest)
     axes = np.linalg.solve(root.T, basis @ axes)
@@ -311,8 +324,10 @@ def _constraint_projector(
     """
     if scene.constraints is None:
         return np.eye(len(y))
-    basis = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]
-    if np.linalg.norm(basis.T @ y) > tolerance * np.linalg.norm(y):
+    constraints = np.asarray(scene.constraints, float)
+    basis, _ = np.linalg.qr(np.linalg.solve(root, constraints))
+    violation = np.linalg.norm(basis.T @ y)
+    if violation > tolerance * np.linalg.norm(y):
         raise ValueError(
             f"Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
             f"0, but is {np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."

@@ -34,7 +34,8 @@ class CappedPolyhedron(NamedTuple):
         0 or less inside the set.
         """
         beyond_ball = np.linalg.norm(w, axis=-1) - self.radius
-        beyond_rows = (self.offset - w @ self.rows.T).max(axis=-1, initial=-np.inf)
+        missing = self.offset - w @ self.rows.T
+        beyond_rows = missing.max(axis=-1, initial=-np.inf)
         return np.maximum(beyond_ball, beyond_rows)
 
     def project(self, point: np.ndarray) -> np.ndarray:
@@ -49,8 +50,10 @@ class CappedPolyhedron(NamedTuple):
             return point
         target = np.zeros(self.rows.shape[1] + 1)
         target[-1] = 1.0
-        active = least_squares(np.vstack([self.rows.T, need / need.max()]), target) > 0
-        return point + np.linalg.lstsq(self.rows[active], need[active], rcond=None)[0]
+        matrix = np.vstack([self.rows.T, need / need.max()])
+        active = least_squares(matrix, target) > 0
+        step = np.linalg.lstsq(self.rows[active], need[active], rcond=None)[0]
+        return point + step
 
     def lowest(self, direction: np.ndarray) -> np.ndarray:
         """A point w (d,) of the set where `direction . w` is least."""
@@ -65,24 +68,25 @@ class CappedPolyhedron(NamedTuple):
         # ends it
         def beyond(s: float) -> float:
             """Distance of the minimizer of this s from the ball; negative inside."""
-            return float(np.linalg.norm(self.project(-s * c)) - self.radius)
+            minimizer = self.project(-s * c)
+            return float(np.linalg.norm(minimizer) - self.radius)
 
         far = self.radius
         while beyond(far) < 0:
             w = self.project(-far * c)
-            touching = self.rows[self.rows @ w - self.offset <= _ROUNDING * self.radius]
+            slack = self.rows @ w - self.offset
+            touching = self.rows[slack <= _ROUNDING * self.radius]
             # c in the cone of the rows that hold with equality: c.w is least here
             # without the ball
             in_cone = touching.T @ least_squares(touching.T, c)
-            if (
-                np.linalg.norm(in_cone - c) <= _ROUNDING
-                or far > _FARTHEST * self.radius
-            ):
+            is_in_cone = np.linalg.norm(in_cone - c) <= _ROUNDING
+            if is_in_cone or far > _FARTHEST * self.radius:
                 return w
             far *= 4
         if beyond(0.0) >= 0:
             return self.project(np.zeros_like(c))
-        s = brentq(beyond, 0.0, far, xtol=1e-300, rtol=4 * np.finfo(float).eps)
+        precision = 4 * np.finfo(float).eps
+        s = brentq(beyond, 0.0, far, xtol=1e-300, rtol=precision)
         return self.project(-s * c)
 
     def interior(self) -> np.ndarray:
@@ -95,25 +99,27 @@ class CappedPolyhedron(NamedTuple):
         from scipy.optimize import linprog  # late: slow to import
 
         dimension = self.rows.shape[1]
-        box = [(-self.radius, self.radius)] * dimension + [(0.0, self.radius)]
-        slack = np.hstack([-self.rows, np.ones((len(self.rows), 1))])
+        within_ball = [(-self.radius, self.radius)] * dimension
+        box = [*within_ball, (0.0, self.radius)]
+        distances = np.ones((len(self.rows), 1))
+        slack = np.hstack([-self.rows, distances])
         cost = np.append(np.zeros(dimension), -1.0)  # linprog minimizes -t
-        deep = linprog(cost, slack, -self.offset, bounds=box).x[:-1]
+        optimum = linprog(cost, slack, -self.offset, bounds=box)
+        deep = optimum.x[:-1]
         least = self.project(np.zeros(dimension))
         step = deep - least
         if not step.any():
             return least
-        return (
-            least
-            + 0.5 * min(1.0, _chord(least[None], step[None], self.radius)[1][0]) * step
-        )
+        _, leaves = _chord(least[None], step[None], self.radius)
+        return least + 0.5 * min(1.0, leaves[0]) * step
 
     def sample(self, generator: np.random.Generator, count: int) -> np.ndarray:
         """`count` points (count, d), uniform: each the end of its own hit-and-run
         walk.
         """
         dimension = self.rows.shape[1]
-        points = np.repeat(self.interior()[None], count, axis=0)
+        start = self.interior()[None]
+        points = np.repeat(start, count, axis=0)
         for _ in range(_MIXING * dimension):
             step = generator.normal(size=points.shape)
             step /= np.linalg.norm(step, axis=1, keepdims=True)
@@ -124,12 +130,10 @@ class CappedPolyhedron(NamedTuple):
             with np.errstate(divide="ignore", invalid="ignore"):
                 reach = -slack / rate
             low, high = _chord(points, step, self.radius)
-            high = np.minimum(
-                high, np.where(rate < 0, reach, np.inf).min(1, initial=np.inf)
-            )
-            low = np.maximum(
-                low, np.where(rate > 0, reach, -np.inf).max(1, initial=-np.inf)
-            )
+            falls = np.where(rate < 0, reach, np.inf)
+            high = np.minimum(high, falls.min(1, initial=np.inf))
+            rises = np.where(rate > 0, reach, -np.inf)
+            low = np.maximum(low, rises.max(1, initial=-np.inf))
             position = low + (high - low) * generator.random(count)
             points = points + position[:, None] * step
         return points
@@ -141,30 +145,30 @@ class CappedPolyhedron(NamedTuple):
         Row i meets the circle at its own angle +- arccos(offset_i / r). The set is
         expected to have one such part; of several, one is returned.
         """
-        angle = np.arctan2(self.rows[:, 1], self.rows[:, 0])
+        x, y = self.rows.T
+        angle = np.arctan2(y, x)
         cut = np.abs(self.offset) <= self.radius
         half = np.arccos(self.offset[cut] / self.radius)
-        ends = np.sort(
-            np.concatenate([angle[cut] - half, angle[cut] + half]) % (2 * np.pi)
-        )
+        both = np.concatenate([angle[cut] - half, angle[cut] + half])
+        ends = np.sort(both % (2 * np.pi))
         if len(ends) == 0:
-            inside = (
-                self.excess(self.on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
-            )
+            first_point = self.on_circle(np.zeros(1))
+            inside = self.excess(first_point)[0] <= _ROUNDING * self.radius
             if inside:
                 return (0.0, 2 * np.pi)
             return None
         # pieces of the circle between neighbouring ends; feasible: its midpoint is in
         # the set
-        width = np.diff(np.append(ends, ends[0] + 2 * np.pi))
-        feasible = (
-            self.excess(self.on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
-        )
+        once_around = ends[0] + 2 * np.pi
+        width = np.diff(np.append(ends, once_around))
+        middles = self.on_circle(ends + 0.5 * width)
+        feasible = self.excess(middles) <= _ROUNDING * self.radius
         if feasible.all():
             return 0.0, 2 * np.pi
         # the feasible pieces that follow one that is not: from `first` to the next that
         # is not
-        first = int(np.argmax(feasible & ~np.roll(feasible, 1)))
+        before = np.roll(feasible, 1)
+        first = int(np.argmax(feasible & ~before))
         run = np.roll(feasible, -first)
         widths = np.roll(width, -first)
         length = widths[: np.argmin(run)].sum()
@@ -181,18 +185,21 @@ class CappedPolyhedron(NamedTuple):
         for i, j in combinations(range(len(self.rows)), 2):
             pair = self.rows[[i, j]]
             if abs(np.linalg.det(pair)) > _INDEPENDENT:
-                corners.append(np.linalg.solve(pair, self.offset[[i, j]])[None])
+                corner = np.linalg.solve(pair, self.offset[[i, j]])
+                corners.append(corner[None])
         arc = self.arc()
         if arc is not None:
             corners.append(self.on_circle(np.linspace(*arc, arc_points)))
         points = np.concatenate(corners)
         points = points[self.excess(points) <= _ROUNDING * self.radius]
         relative = points - self.interior()
-        return points[np.argsort(np.arctan2(relative[:, 1], relative[:, 0]))]
+        x, y = relative.T
+        return points[np.argsort(np.arctan2(y, x))]
 
     def on_circle(self, angle: np.ndarray) -> np.ndarray:
         """Points (..., 2) of the circle at angles [rad]."""
-        return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        components = [np.cos(angle), np.sin(angle)]
+        return self.radius * np.stack(components, axis=-1)
 
 
 def capped_polyhedron(
@@ -211,13 +218,16 @@ def capped_polyhedron(
     box = [(-radius, radius)] * rows.shape[1]
     flat = np.zeros(len(rows), bool)
     if may_be_flat:
-        highest = [-linprog(-row, -rows, -offset, bounds=box).fun for row in rows]
+        optima = (linprog(-row, -rows, -offset, bounds=box) for row in rows)
+        highest = [-optimum.fun for optimum in optima]
         flat = np.array(highest) - offset <= _FLAT * radius
     _, singular, basis = np.linalg.svd(rows[flat])
     # null space of the equalities
     axes = basis[int((singular > _INDEPENDENT).sum()) :].T
-    centre = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
-    inner = float(np.sqrt(max(radius**2 - float(centre @ centre), 0.0)))
+    solved = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)
+    centre = solved[0]
+    distance_squared = float(centre @ centre)
+    inner = float(np.sqrt(max(radius**2 - distance_squared, 0.0)))
     offset = offset[~flat] - rows[~flat] @ centre
     within = _unit_rows(rows[~flat] @ axes, offset, _INDEPENDENT)
     return CappedPolyhedron(*within, inner), centre, axes
@@ -229,7 +239,8 @@ def _unit_rows(
     """The rows longer than `least` and their offsets, scaled to unit length."""
     length = np.linalg.norm(rows, axis=1)
     kept = length > least
-    return rows[kept] / length[kept, None], offset[kept] / length[kept]
+    unit = rows[kept] / length[kept, None]
+    return unit, offset[kept] / length[kept]
 
 
 def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -275,7 +286,8 @@ def _on_support(
     columns).
     """
     x = np.zeros(matrix.shape[1])
-    x[support] = np.linalg.lstsq(matrix[:, support], target, rcond=None)[0]
+    solved = np.linalg.lstsq(matrix[:, support], target, rcond=None)
+    x[support] = solved[0]
     return x
 
 
@@ -305,10 +317,13 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
         if np.ptp(unit) == 0:
             return unit[:, :1]
         return np.zeros((0, 1))
-    outward = ConvexHull(np.vstack([np.zeros(rank), unit.T])).equations
-    normals = -outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
+    corners = np.vstack([np.zeros(rank), unit.T])
+    outward = ConvexHull(corners).equations
+    through_apex = np.abs(outward[:, -1]) <= _INDEPENDENT
+    normals = -outward[through_apex, :-1]
     # a facet that is no simplex is reported in parts; one that stays twice does no harm
-    _, first = np.unique(np.round(normals / _INDEPENDENT), axis=0, return_index=True)
+    rounded = np.round(normals / _INDEPENDENT)
+    _, first = np.unique(rounded, axis=0, return_index=True)
     return normals[np.sort(first)]
 
 
@@ -322,5 +337,6 @@ def _chord(
     """
     a = (steps**2).sum(1)
     b = (points * steps).sum(1)
-    root = np.sqrt(np.maximum(b**2 + a * (radius**2 - (points**2).sum(1)), 0.0))
+    inside = radius**2 - (points**2).sum(1)
+    root = np.sqrt(np.maximum(b**2 + a * inside, 0.0))
     return (-b - root) / a, (-b + root) / a

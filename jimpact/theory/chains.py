@@ -64,13 +64,15 @@ def bilateral_motion(
         return velocity_change(scene, -k * gap_velocity(scene, x))
 
     # (x, x')' = flow (x, x')
-    pull = jax.vmap(acceleration, out_axes=1)(jnp.eye(n, dtype=v.dtype))
+    displacements = jnp.eye(n, dtype=v.dtype)
+    pull = jax.vmap(acceleration, out_axes=1)(displacements)
     zero = jnp.zeros((n, n), v.dtype)
-    flow = jnp.block([[zero, jnp.eye(n, dtype=v.dtype)], [pull, zero]])
+    identity = jnp.eye(n, dtype=v.dtype)
+    flow = jnp.block([[zero, identity], [pull, zero]])
     # expm, not eigenvectors: those of equal frequencies have no derivative
-    end = jax.scipy.linalg.expm(t * flow, max_squarings=64) @ jnp.concatenate(
-        [jnp.zeros_like(v), v]
-    )
+    start = jnp.concatenate([jnp.zeros_like(v), v])
+    transition = jax.scipy.linalg.expm(t * flow, max_squarings=64)
+    end = transition @ start
     return end[:n], end[n:]
 
 
@@ -97,8 +99,10 @@ def newby_ratio(n: int) -> float:
     (2.241338, 6.171293)
     """
     n = as_whole("n", n, 2)
-    root = float(np.sqrt(9 * n**8 - 12 * n**6 - 42 * n**4 - 12 * n**2 + 9))
-    return (3 * n**4 - 2 * n**2 + 3 + root) / (8 * n**2)
+    square = 9 * n**8 - 12 * n**6 - 42 * n**4 - 12 * n**2 + 9
+    root = float(np.sqrt(square))
+    numerator = 3 * n**4 - 2 * n**2 + 3 + root
+    return numerator / (8 * n**2)
 
 
 class SeparationTimes(NamedTuple):
@@ -145,7 +149,8 @@ def separation_times(stiffness_ratio: float) -> SeparationTimes:
             f"but has value {g:g}."
         )
     if g == 0:
-        return SeparationTimes(float(np.pi / np.sqrt(2)), float(np.inf))
+        first = float(np.pi / np.sqrt(2))
+        return SeparationTimes(first, float(np.inf))
     root = float(np.sqrt(g * g - g + 1))
     high = float(np.sqrt(1 + g + root))
     low = float(np.sqrt(3 * g)) / high  # their product; 1 + g - root would cancel
@@ -155,13 +160,14 @@ def separation_times(stiffness_ratio: float) -> SeparationTimes:
 
         def squeeze(t: Any) -> Any:
             """Indentation of the contact at time t, but for a positive factor."""
-            return slow * np.sin(low * t) / low + fast * np.sin(high * t) / high
+            slow_part = slow * np.sin(low * t) / low
+            return slow_part + fast * np.sin(high * t) / high
 
-        times = np.arange(1, int(2 * np.pi * high / low / _GRID) + 2) * _GRID / high
+        steps = int(2 * np.pi * high / low / _GRID) + 2
+        times = np.arange(1, steps) * _GRID / high
         after = int(np.argmax(squeeze(times) <= 0))
-        return float(
-            brentq(squeeze, times[after - 1], times[after], xtol=1e-15, rtol=1e-15)
-        )
+        last = times[after - 1]
+        return float(brentq(squeeze, last, times[after], xtol=1e-15, rtol=1e-15))
 
     # Delta - 1 + g and Delta + 1 - g, written so that nothing cancels; root is Delta
     rising = g + (g * g - g) / (root + 1)
@@ -241,8 +247,10 @@ def reinsch_chain(
         as_numbers(name, value, low=0.0, open_low=True)
     j = np.arange(n + 1)
     # m_j / m_0
-    share = np.exp(_log_central(j) + _log_central(n - j) - _log_central(np.asarray(n)))
-    springs = share[:-1] * (j[:-1] + 0.5) * (n - j[:-1]) / (n / 2)  # k_j / k_0
+    whole = _log_central(np.asarray(n))
+    share = np.exp(_log_central(j) + _log_central(n - j) - whole)
+    left = share[:-1] * (j[:-1] + 0.5)
+    springs = left * (n - j[:-1]) / (n / 2)  # k_j / k_0
     return jnp.asarray(mass * share), jnp.asarray(stiffness * springs)
 
 
@@ -252,4 +260,5 @@ def _log_central(j: np.ndarray) -> np.ndarray:
 
     Equation: `binom(2 j, j) / 4^j = Gamma(j + 1/2) / (sqrt(pi) Gamma(j + 1))`.
     """
-    return gammaln(j + 0.5) - gammaln(j + 1) - 0.5 * np.log(np.pi)
+    gamma_ratio = gammaln(j + 0.5) - gammaln(j + 1)
+    return gamma_ratio - 0.5 * np.log(np.pi)

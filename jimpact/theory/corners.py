@@ -61,16 +61,16 @@ def reentrant_corner(
     [ 0.5 -0.4] 0 False
     """
     v = as_velocity(scene, velocity, finite=True)
-    e = as_numbers(
-        "restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts
-    )
+    m = scene.contacts
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=m)
     approach = -np.asarray(normalized_gap_velocity(scene, v), float)
     if (approach <= 0).any():
         return []
     each = np.broadcast_to(np.asarray(e, float), approach.shape)
     # row j: contact j acts alone, p_j = (1 + e_j) |gamma_j| / W_jj; approach has
     # |gamma| / sqrt(W)
-    impulses = np.diag((1 + each) * approach / np.asarray(kinetic_norm(scene), float))
+    root_w = np.asarray(kinetic_norm(scene), float)
+    impulses = np.diag((1 + each) * approach / root_w)
     least = approach.min() * (1 + EQUAL)
     return [
         CornerOutcome(

@@ -65,7 +65,8 @@ def energy_dispersion(scene: Scene, velocity: Any) -> jax.Array:
     square = jnp.mean((share - mean) ** 2)
     # the inner `where` keeps the derivative of the root finite where all shares are
     # equal
-    deviation = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    positive = jnp.where(square > 0, square, 1.0)
+    deviation = jnp.where(square > 0, jnp.sqrt(positive), 0.0)
     return deviation / mean
 
 
@@ -95,4 +96,5 @@ def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
     0.666667
     """
     spread = energy_dispersion(scene, velocity)
-    return 1 - spread / jnp.sqrt(jnp.asarray(scene.size - 1, spread.dtype))
+    others = jnp.asarray(scene.size - 1, spread.dtype)
+    return 1 - spread / jnp.sqrt(others)

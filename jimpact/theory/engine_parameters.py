@@ -32,7 +32,8 @@ def _pulling_oscillator(ratio: float) -> float:
     Equation: `e = exp(-pi D / sqrt(1 - D^2))`, 0 from D = 1 on.
     """
     if ratio < 1:
-        return math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2))
+        frequency = math.sqrt(1 - ratio**2)
+        return math.exp(-math.pi * ratio / frequency)
     return 0.0
 
 
@@ -46,11 +47,13 @@ def _cut_oscillator(ratio: float) -> float:
     """
     if ratio < 1:
         root = math.sqrt(1 - ratio**2)
-        return math.exp(-2 * ratio * math.atan2(root, ratio) / root)
+        phase = math.atan2(root, ratio)
+        return math.exp(-2 * ratio * phase / root)
     if ratio == 1:
         return math.exp(-2)
     root = math.sqrt(ratio**2 - 1)
-    return math.exp(-2 * ratio * math.log(ratio + root) / root)
+    growth = math.log(ratio + root)
+    return math.exp(-2 * ratio * growth / root)
 
 
 def _hunt_crossley(damping: float) -> float:
@@ -63,18 +66,21 @@ def _hunt_crossley(damping: float) -> float:
         return 1.0
     if damping > _STRONG:
         shifted = 1 + damping
-        return (1 + float(lambertw(-shifted * math.exp(-shifted)).real)) / damping
+        solution = lambertw(-shifted * math.exp(-shifted))
+        return (1 + float(solution.real)) / damping
 
     def excess(e: float) -> float:
         """`(1 + e) a - ln((1 + a) / (1 - a e))`, which falls with e."""
-        return (1 + e) * damping - math.log1p(damping) + math.log1p(-damping * e)
+        returned = math.log1p(-damping * e)
+        return (1 + e) * damping - math.log1p(damping) + returned
 
     return float(brentq(excess, 0.0, 1.0))
 
 
 def _damping_ratio(e: float) -> float:
     """`D = -ln(e) / sqrt(pi^2 + ln(e)^2)`, the inverse of `_pulling_oscillator`."""
-    return -math.log(e) / math.hypot(math.pi, math.log(e))
+    decrement = math.log(e)
+    return -decrement / math.hypot(math.pi, decrement)
 
 
 def _tsuji_alpha(e: float) -> float:
@@ -92,7 +98,8 @@ def _exudyn_2(e: float) -> float:
     """
     if e < _CHANGE:
         return (1 - e**2) / e
-    return 1.5 * (1 - e) * (11 - e) / (1 + 9 * e)
+    numerator = 1.5 * (1 - e) * (11 - e)
+    return numerator / (1 + 9 * e)
 
 
 class _Engine(NamedTuple):

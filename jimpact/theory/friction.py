@@ -59,10 +59,12 @@ def contact_coupling(scene: Scene) -> jax.Array:
     """
     n_q, t_q = quasi_basis(scene)
     g = as_matrix(normalized_delassus(scene))
-    of_normal = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
+    none = jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)
+    of_normal = jnp.concatenate([g, none])
     if scene.tangents is None:
         return of_normal
-    of_tangential = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
+    h = scene.tangents
+    of_tangential = jnp.concatenate([n_q.T @ h, t_q.T @ h])
     return jnp.concatenate([of_normal, of_tangential], axis=1)
 
 
@@ -123,10 +125,8 @@ def restitution_inclusion(
     if lam.ndim == 0:
         lam = lam * jnp.eye(n, dtype=lam.dtype)
     check_shape("restitution", lam, (n, n), "or a scalar")
-    low, high = (
-        jnp.broadcast_to(as_float_array(name, x), (c,))
-        for name, x in (("low", low), ("high", high))
-    )
+    low = jnp.broadcast_to(as_float_array("low", low), (c,))
+    high = jnp.broadcast_to(as_float_array("high", high), (c,))
     gamma = gbar.T @ metric_p
     y = gamma @ (v + lam @ v)  # Gamma (v+ + Lambda v-) without percussion, v+ = v-
     percussion, code = _box_multipliers(gamma @ gbar, y, low, high)
@@ -147,10 +147,12 @@ def _box_multipliers(
     slack = jnp.where(bounded, slack, 1.0)  # a bound at infinity never binds
     matrix = jnp.block([[s, -s], [-s, s]])
     both = bounded[:, None] & bounded[None, :]
-    matrix = jnp.where(both, matrix, jnp.eye(2 * len(y), dtype=s.dtype))
+    identity = jnp.eye(2 * len(y), dtype=s.dtype)
+    matrix = jnp.where(both, matrix, identity)
     # p = p_low - p_high is unique where S is regular, whatever the two parts are
     solution = solve_lcp(matrix, slack, regular=True)
-    return solution.z[: len(y)] - solution.z[len(y) :], solution.code
+    of_low = solution.z[: len(y)]
+    return of_low - solution.z[len(y) :], solution.code
 
 
 class FrictionBounds(NamedTuple):
@@ -184,9 +186,8 @@ class FrictionBounds(NamedTuple):
         v- (n,).
         """
         qn, qt = to_quasi_velocities(scene, velocity)
-        return self.condition_i and bool(
-            jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
-        )
+        least = self.least_ratio * jnp.linalg.norm(qt)
+        return self.condition_i and bool(jnp.linalg.norm(qn) >= least)
 
     def __str__(self) -> str:
         """Report: the four conditions with their numbers, a line each."""
@@ -261,28 +262,27 @@ def friction_bounds(
     """
     e = _restitution(scene, matrix)
     coupling = _coupling(scene, friction, slip)
-    mubar = (
-        as_float_array("friction", friction)
-        * jnp.ones(scene.contacts)
-        / kinetic_norm(scene)
-    )
+    mu = as_float_array("friction", friction)
+    mubar = mu * jnp.ones(scene.contacts) / kinetic_norm(scene)
     one_plus = np.eye(len(e)) + e  # I + E
     g = np.asarray(coupling.delassus, float)
     g_mu = np.asarray(coupling.g_mu, float)
-    if np.linalg.cond(g_mu) > 1 / (len(g) * np.finfo(scene.mass.dtype).eps):
+    rounding = len(g) * np.finfo(scene.mass.dtype).eps
+    if np.linalg.cond(g_mu) > 1 / rounding:
         raise ValueError(
             f"Argument `friction` must leave G^mu regular, but {np.asarray(friction)} "
             f"makes it singular."
         )
     inverse = np.linalg.inv(g)
-    m_bar = (np.eye(len(e)) - e).T @ inverse @ one_plus
+    one_minus = np.eye(len(e)) - e
+    m_bar = one_minus.T @ inverse @ one_plus
     # t_q^T H_t [mubar][xi]
-    slide = (
-        np.asarray(coupling.tangential, float) * np.asarray(coupling.friction)[None, :]
-    )
+    along = np.asarray(coupling.tangential, float)
+    slide = along * np.asarray(coupling.friction)[None, :]
     b = slide @ np.linalg.solve(g_mu, one_plus)
     k = b.T @ b
-    least = float(np.linalg.eigvalsh(0.5 * (m_bar + m_bar.T))[0])
+    symmetric = 0.5 * (m_bar + m_bar.T)
+    least = float(np.linalg.eigvalsh(symmetric)[0])
     largest = float(np.linalg.eigvalsh(k)[-1])
     largest_mu = float(jnp.abs(mubar).max())
     # numerator of Theorem 6.2 (ii)
@@ -334,7 +334,8 @@ def friction_impulses(
     e = _restitution(scene, matrix)
     coupling = _coupling(scene, friction, slip)
     qn = normalized_gap_velocity(scene, velocity)
-    pbar = -jnp.linalg.solve(coupling.g_mu, qn + jnp.asarray(e, qn.dtype) @ qn)
+    returned = jnp.asarray(e, qn.dtype) @ qn
+    pbar = -jnp.linalg.solve(coupling.g_mu, qn + returned)
     return pbar / kinetic_norm(scene), -coupling.friction * pbar
 
 
@@ -380,13 +381,15 @@ def friction_energy_change(
     qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ p_t
     qt_change = coupling.tangential @ p_t
     normal = pbar + jnp.linalg.solve(coupling.delassus, coupling.normal @ p_t)
-    return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + qt_change) @ qt_change
+    of_normal = 0.5 * (qn_plus + qn) @ normal
+    return of_normal + 0.5 * (2 * qt + qt_change) @ qt_change
 
 
 def _norm(matrix: jax.Array | np.ndarray) -> float:
     """Largest singular value; 0 of an empty matrix."""
     if np.size(matrix):
-        return float(np.linalg.norm(np.asarray(matrix, float), 2))
+        values = np.asarray(matrix, float)
+        return float(np.linalg.norm(values, 2))
     return 0.0
 
 
@@ -418,7 +421,8 @@ def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
     unit = jnp.eye(m, dtype=scene.mass.dtype)
     none = jnp.zeros(m, scene.mass.dtype)
     # M^-1 H_t (n, m): column j is v+ - v- of a unit tangential impulse at contact j
-    changes = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
+    change_of = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)
+    changes = change_of(unit)
     return _Coupling(
         delassus=as_matrix(normalized_delassus(scene)),
         normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(changes),

@@ -84,11 +84,14 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
     scale = gap_scale(scene, law, velocity)
     delta = jnp.max(scale.delta)
     # gaps (s, 2) = mean +- delta s / 2, the mean large enough for gaps >= 0
-    mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
-    gaps = mean + 0.5 * delta * s[:, None] * jnp.array([1.0, -1.0], s.dtype)[None, :]
+    largest = 0.5 * delta * jnp.max(jnp.abs(s))
+    mean = jnp.maximum(jnp.mean(scale.gaps), largest)
+    signs = jnp.array([1.0, -1.0], s.dtype)
+    gaps = mean + 0.5 * delta * s[:, None] * signs[None, :]
     v = as_float_array("velocity", velocity)
     gaps = jnp.maximum(gaps, 0.0)
-    out = jax.vmap(lambda each: impact(law, with_gaps(scene, each), v))(gaps)
+    impact_at = jax.vmap(lambda each: impact(law, with_gaps(scene, each), v))
+    out = impact_at(gaps)
     return Crossover(s, out.velocity, out.status)
 
 
@@ -150,7 +153,8 @@ class GapSensitivity:
             raise ValueError(
                 "Argument `sampled` must be given for a comparison, but is None."
             )
-        linear = np.sqrt(np.diag(self.covariance(self.sampled.gap_covariance)))
+        covariance = self.covariance(self.sampled.gap_covariance)
+        linear = np.sqrt(np.diag(covariance))
         with np.errstate(divide="ignore", invalid="ignore"):
             return linear / self.sampled.std
 
@@ -162,10 +166,13 @@ class GapSensitivity:
         lines = [
             f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"
         ]
-        for i, (v, row) in enumerate(zip(self.velocity, self.jacobian)):
+        rows = zip(self.velocity, self.jacobian)
+        for i, (v, row) in enumerate(rows):
             numbers = "".join(f"{x:13.5g}" for x in row)
             lines.append(f"v{i + 1}+ = {v:10.6f} m/s: {numbers}")
-        return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
+        if self.sampled is not None:
+            lines += self._comparison()
+        return "\n".join(lines)
 
     def _comparison(self) -> list[str]:
         """Report lines: linearized against sampled standard deviations [m/s], and a
@@ -173,13 +180,13 @@ class GapSensitivity:
         """
         assert self.sampled is not None
         ratio = self.explained
-        largest = np.max(
-            np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0
-        )
+        ends = [self.sampled.minimum, self.sampled.maximum]
+        largest = np.max(np.abs(ends), initial=0.0)
         if np.all(self.sampled.std <= CONSTANT * largest):
             return ["The outcome does not depend on the gaps."]
         lines = ["standard deviations [m/s], linearized against sampled:"]
-        for i, (std, part) in enumerate(zip(self.sampled.std, ratio)):
+        rows = zip(self.sampled.std, ratio)
+        for i, (std, part) in enumerate(rows):
             lines.append(f"v{i + 1}+: {part * std:.3g} against {std:.3g}")
         if np.all(np.abs(ratio - 1) <= AGREES):
             lines.append("The outcome is nearly linear over the spread of the gaps.")
@@ -228,7 +235,8 @@ def gap_sensitivity(
     >>> found.velocity.round(6).tolist()
     [-0.6, -0.16, 1.24]
     """
-    at = as_numbers("gaps", gaps, (scene.contacts,), "one gap per contact", low=0.0)
+    shape = (scene.contacts,)
+    at = as_numbers("gaps", gaps, shape, "one gap per contact", low=0.0)
     v = as_float_array("velocity", velocity)
 
     def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
@@ -238,7 +246,8 @@ def gap_sensitivity(
         out = impact(law, with_gaps(scene, gaps), v)
         return out.velocity, (out.velocity, out.status)
 
-    jacobian, (after, status) = jax.jacfwd(outcome, has_aux=True)(at)
+    differentiated = jax.jacfwd(outcome, has_aux=True)
+    jacobian, (after, status) = differentiated(at)
     return GapSensitivity(
         gaps=np.asarray(at),
         velocity=np.asarray(after),

@@ -76,7 +76,8 @@ class _Problem:
         m = self.contacts
         each = len(self.matrix) // self.contacts
         # axes: normal or tangent, contact; once for rows and once for columns
-        blocks = np.abs(self.matrix).reshape(each, m, each, m)
+        axes = (each, m, each, m)
+        blocks = np.abs(self.matrix).reshape(axes)
         coupled: np.ndarray = blocks.max(axis=(0, 2)) > SINGULAR
         return coupled
 
@@ -84,7 +85,8 @@ class _Problem:
         """Largest normalized approach velocity -qn of a closed contact, 0 where none
         approaches.
         """
-        return float(np.max(-node.state[: self.contacts][self.closed], initial=0.0))
+        qn = node.state[: self.contacts]
+        return float(np.max(-qn[self.closed], initial=0.0))
 
 
 # States of the tree (m + t,) by the whole number that `_is_new` gives them.
@@ -100,9 +102,12 @@ def _is_new(state: np.ndarray, visited: Cells) -> bool:
     compared.
     """
     weights = np.sqrt(np.arange(2.0, len(state) + 2))
-    cell = int(np.floor(state @ weights / (2 * ZERO * weights.sum())))
-    near = [old for k in (cell - 1, cell, cell + 1) for old in visited.get(k, [])]
-    if any(np.abs(old - state).max() <= ZERO for old in near):
+    size = 2 * ZERO * weights.sum()
+    cell = int(np.floor(state @ weights / size))
+    cells = (cell - 1, cell, cell + 1)
+    near = [old for k in cells for old in visited.get(k, [])]
+    distances = (np.abs(old - state).max() for old in near)
+    if any(distance <= ZERO for distance in distances):
         return False
     visited.setdefault(cell, []).append(state)
     return True
@@ -172,7 +177,8 @@ def han_gilmore(
     start = _Node(state, np.zeros_like(state))
     size = problem.approach(start)
     if size == 0.0:
-        return [HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])]
+        nothing = HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])
+        return [nothing]
     start.state = state / size
     found: list[_Node] = []  # ends of branches: nothing approaches
     # nodes after equally many impacts, and all so far
@@ -190,7 +196,8 @@ def han_gilmore(
                 # off here
                 if ROUNDING < approach <= ZERO:
                     for other in found:
-                        near = np.abs(other.state - child.state).max() <= 2 * ZERO
+                        difference = np.abs(other.state - child.state)
+                        near = difference.max() <= 2 * ZERO
                         other.endless |= bool(near)
         if following and len(following[0].rules) >= max_depth:
             raise RuntimeError(
@@ -202,9 +209,8 @@ def han_gilmore(
     for node in found:
         p = node.p * size / problem.root
         after = v + problem.mobility @ p
-        outcomes.append(
-            HanGilmoreOutcome(after, p[:m], node.rules, p[m:], node.endless)
-        )
+        outcome = HanGilmoreOutcome(after, p[:m], node.rules, p[m:], node.endless)
+        outcomes.append(outcome)
     return outcomes
 
 
@@ -228,19 +234,23 @@ def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
                 "Argument `scene` must have one tangent a contact (planar) where there "
                 "is friction."
             )
-        rows = np.concatenate([rows, np.asarray(scene.tangents, float)], axis=1)
+        tangents = np.asarray(scene.tangents, float)
+        rows = np.concatenate([rows, tangents], axis=1)
         mu = np.broadcast_to(np.asarray(friction, float), (m,))
     inverse = np.linalg.inv(dense_mass(scene))
     if scene.constraints is not None:  # M^-1 - M^-1 H (H^T M^-1 H)^-1 H^T M^-1
         h = np.asarray(scene.constraints, float)
         inverse_h = inverse @ h
-        inverse = inverse - inverse_h @ np.linalg.solve(h.T @ inverse_h, inverse_h.T)
+        held = np.linalg.solve(h.T @ inverse_h, inverse_h.T)
+        inverse = inverse - inverse_h @ held
     mobility = inverse @ rows
     w = rows.T @ mobility
-    root = np.tile(np.sqrt(np.diag(w)[:m]), len(w) // m)
+    of_normals = np.sqrt(np.diag(w)[:m])
+    root = np.tile(of_normals, len(w) // m)
     e = np.broadcast_to(np.asarray(restitution, float), (m,))
     closed = np.asarray(scene.closed)
-    return _Problem(w / np.outer(root, root), e, mu, closed, rows, mobility, root)
+    normalized = w / np.outer(root, root)
+    return _Problem(normalized, e, mu, closed, rows, mobility, root)
 
 
 def _impacts(problem: _Problem, node: _Node) -> Iterator[_Node]:
@@ -297,14 +307,16 @@ def _impact(
     solved = np.linalg.lstsq(block, target, rcond=SINGULAR)[0]
     pushes = solved[:count]
     p_t = solved[count:]
-    if np.abs(block @ solved - target).max() > ZERO or np.any(pushes <= ZERO):
+    residual = np.abs(block @ solved - target).max()
+    if residual > ZERO or np.any(pushes <= ZERO):
         return None
     p = np.zeros_like(node.p)
     p[rows] = solved
     state = node.state + problem.matrix @ p
     state[at] = -problem.restitution[at] * node.state[at]
     if mu is not None:
-        if np.any((slides == 0) & (np.abs(p_t) > mu[at] * pushes + ZERO)):
+        beyond = np.abs(p_t) > mu[at] * pushes + ZERO
+        if np.any((slides == 0) & beyond):
             return None
         if np.any(slides * state[m + at] < -ZERO):
             return None
@@ -324,7 +336,8 @@ def _active_sets(
     known = {approaching.tobytes()}
     for active in sets:
         yield active
-        for j in np.flatnonzero(resting & ~active & coupled[active].any(axis=0)):
+        touched = coupled[active].any(axis=0)
+        for j in np.flatnonzero(resting & ~active & touched):
             larger = active.copy()
             larger[j] = True
             if larger.tobytes() not in known:
@@ -340,9 +353,8 @@ def _rule(
 
     All arguments are masks (m,).
     """
-    why = np.where(
-        approaching, "approaching", np.where(resting, "at rest", "separating")
-    )
+    not_approaching = np.where(resting, "at rest", "separating")
+    why = np.where(approaching, "approaching", not_approaching)
     cases = (("p > 0", active), ("p = 0", closed & ~active))
     texts = [
         f"{case} at " + ", ".join(f"{j} ({why[j]})" for j in np.flatnonzero(chosen))

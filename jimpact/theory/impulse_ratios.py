@@ -39,7 +39,8 @@ def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
     energy = as_numbers("energy", energy, low=0.0)
     stiffness = as_numbers("stiffness", stiffness, low=0.0, open_low=True)
     eta = as_numbers("exponent", exponent, low=1.0)
-    force = ((1 + eta) * energy) ** (eta / (1 + eta)) * stiffness ** (1 / (1 + eta))
+    stored = ((1 + eta) * energy) ** (eta / (1 + eta))
+    force = stored * stiffness ** (1 / (1 + eta))
     return force[:, None] / force[None, :]
 
 
@@ -74,9 +75,8 @@ def correlation_interval(
     >>> round(float(low[0, 1]), 6), round(float(high[0, 1]), 6)
     (0.5, 0.948753)
     """
-    e = as_numbers(
-        "restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts
-    )
+    m = scene.contacts
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=m)
     return interval(scene, e)
 
 
@@ -108,4 +108,5 @@ def precompression_energy(force: Any, stiffness: Any, exponent: Any = 1.5) -> ja
     force = as_numbers("force", force, low=0.0)
     stiffness = as_numbers("stiffness", stiffness, low=0.0, open_low=True)
     eta = as_numbers("exponent", exponent, low=1.0)
-    return force ** ((eta + 1) / eta) / ((eta + 1) * stiffness ** (1 / eta))
+    work = force ** ((eta + 1) / eta)
+    return work / ((eta + 1) * stiffness ** (1 / eta))

@@ -56,14 +56,9 @@ def hertz_stiffness(
     >>> round(float(plane / k), 6)  # a plane is stiffer by sqrt(2)
     1.414214
     """
-    e1, nu1, r1 = (
-        as_float_array(name, value)
-        for name, value in (
-            ("modulus", modulus),
-            ("poisson", poisson),
-            ("radius", radius),
-        )
-    )
+    e1 = as_float_array("modulus", modulus)
+    nu1 = as_float_array("poisson", poisson)
+    r1 = as_float_array("radius", radius)
     if modulus2 is None:
         e2 = e1
     else:
@@ -79,12 +74,12 @@ def hertz_stiffness(
     for name, value in (("modulus", e1), ("radius", r1)):
         check_values(name, value, low=0.0, open_low=True)
     for name, value in (("modulus2", e2), ("radius2", r2)):  # infinite: rigid, plane
-        check_values(
-            name, jnp.minimum(value, jnp.finfo(value.dtype).max), low=0.0, open_low=True
-        )
+        finite = jnp.minimum(value, jnp.finfo(value.dtype).max)
+        check_values(name, finite, low=0.0, open_low=True)
     for name, value in (("poisson", nu1), ("poisson2", nu2)):
         check_values(name, value, low=-1.0, high=0.5)
-    compliance = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
+    of_first = (1 - nu1**2) / e1
+    compliance = of_first + (1 - nu2**2) / e2
     curvature = 1 / r1 + 1 / r2
     return 4 / 3 / (compliance * jnp.sqrt(curvature))
 
@@ -142,11 +137,12 @@ def mindlin_ratio(
     else:
         e2 = as_float_array("modulus2", modulus2)
     check_values("modulus", e1, low=0.0, open_low=True)
-    check_values(
-        "modulus2", jnp.minimum(e2, jnp.finfo(e2.dtype).max), low=0.0, open_low=True
-    )
-    normal = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
-    tangential = (1 + nu1) * (2 - nu1) / e1 + (1 + nu2) * (2 - nu2) / e2
+    finite = jnp.minimum(e2, jnp.finfo(e2.dtype).max)
+    check_values("modulus2", finite, low=0.0, open_low=True)
+    of_first = (1 - nu1**2) / e1
+    normal = of_first + (1 - nu2**2) / e2
+    shear = (1 + nu1) * (2 - nu1) / e1
+    tangential = shear + (1 + nu2) * (2 - nu2) / e2
     return 2 * normal / tangential
 
 
@@ -194,11 +190,8 @@ def pair_restitution(
     e2 = as_float_array("second", second)
     for name, e in (("first", e1), ("second", e2)):
         check_values(name, e, low=0.0, high=1.0)
-    given = [
-        name
-        for name, k in (("stiffness", stiffness), ("stiffness2", stiffness2))
-        if k is not None
-    ]
+    both = (("stiffness", stiffness), ("stiffness2", stiffness2))
+    given = [name for name, k in both if k is not None]
     if rule != "energy":
         if given:
             raise ValueError(
@@ -212,13 +205,13 @@ def pair_restitution(
     k1 = as_float_array("stiffness", stiffness)
     k2 = as_float_array("stiffness2", stiffness2)
     for name, k in (("stiffness", k1), ("stiffness2", k2)):  # infinite: rigid
-        check_values(
-            name, jnp.minimum(k, jnp.finfo(k.dtype).max), low=0.0, open_low=True
-        )
+        finite = jnp.minimum(k, jnp.finfo(k.dtype).max)
+        check_values(name, finite, low=0.0, open_low=True)
     check_values("stiffness", jnp.minimum(k1, k2))  # one of them is finite
     share = (1 / k1) / (1 / k1 + 1 / k2)  # of the energy, that of the first body
     square = share * e1**2 + (1 - share) * e2**2
-    own, other = jax.lax.stop_gradient((jnp.sqrt(share), jnp.sqrt(1 - share)))
+    roots = (jnp.sqrt(share), jnp.sqrt(1 - share))
+    own, other = jax.lax.stop_gradient(roots)
     # at e1 = e2 = 0 the root has a slope to each side only
     root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     return jnp.where(square > 0, root, own * e1 + other * e2)

@@ -43,20 +43,16 @@ def spring_slip(
     >>> round(float(ji.theory.spring_slip(0.4, 1.0, 2 / 7)), 6)
     -0.4
     """
-    u, e, kappa, w = (
-        as_float_array(name, value)
-        for name, value in (
-            ("slip", slip),
-            ("restitution", restitution),
-            ("tangential_stiffness", tangential_stiffness),
-            ("ratio", ratio),
-        )
-    )
+    u = as_float_array("slip", slip)
+    e = as_float_array("restitution", restitution)
+    kappa = as_float_array("tangential_stiffness", tangential_stiffness)
+    w = as_float_array("ratio", ratio)
     check_values("slip", u)
     check_values("restitution", e, low=0.0, high=1.0)
     check_values("tangential_stiffness", kappa, low=0.0, open_low=True)
     check_values("ratio", w, low=0.0, open_low=True)
-    return u * jnp.cos(jnp.pi / 2 * (1 + e) * jnp.sqrt(kappa * w))
+    phase = jnp.pi / 2 * (1 + e) * jnp.sqrt(kappa * w)
+    return u * jnp.cos(phase)
 
 
 def walton_slip(
@@ -117,4 +113,5 @@ def walton_slip(
     check_values("ratio", w, low=0.0, open_low=True)
     loss = mu * (1 + e) * w * jnp.abs(gamma)
     sticks = (1 + beta) * jnp.abs(u) <= loss
-    return jnp.where(sticks, -beta * u, u - loss * jnp.sign(u))
+    slid = u - loss * jnp.sign(u)
+    return jnp.where(sticks, -beta * u, slid)

@@ -72,7 +72,8 @@ def admissible_set(
     >>> len(ji.plot.admissible_set(result, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
     1
     """
-    marked = {name: np.asarray(v, float) for name, v in (outcomes or {}).items()}
+    given = (outcomes or {}).items()
+    marked = {name: np.asarray(v, float) for name, v in given}
     for name, v in marked.items():
         if v.shape != (result.scene.size,):
             raise ValueError(
@@ -107,38 +108,36 @@ def _draw_plane(
     figure, axes = new_figure(7.6, title)
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
-    axes.plot(
-        r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3))
-    )
-    axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
+    x = r * np.cos(circle)
+    y = r * np.sin(circle)
+    axes.plot(x, y, color=GREY, lw=0.8, ls=(0, (4, 3)))
+    boundary = frame(result.boundary(400))
+    axes.fill(*boundary.T, color=_FILL, lw=0)
     # gamma_k+ = 0 from u = 0; p_k = 0 from v- along the other contact's push
     for k in (0, 1):
         number = closed[k] + 1
-        _draw_side(
-            axes,
-            frame,
-            np.zeros(2),
-            frame.walls[k],
-            f"contact {number} remains closed",
-            "-",
-        )
+        words = f"contact {number} remains closed"
+        _draw_side(axes, frame, np.zeros(2), frame.walls[k], words, "-")
         away = frame.push[1 - k]
         _draw_side(
             axes, frame, frame.before, away, f"no impulse at contact {number}", ":"
         )
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
-    write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
-    for name, end in (("A", arc[0]), ("B", arc[-1])):
+    middle = arc[len(arc) // 2]
+    write(axes, middle * 1.13, "$T^+ = T^-$", fontsize="medium")
+    ends = (("A", arc[0]), ("B", arc[-1]))
+    for name, end in ends:
         write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
-    axes.plot(
-        *frame.before, "o", color="black", ms=8, ls="none", label="before the impact"
-    )
+    label = "before the impact"
+    axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label=label)
     mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
     for i, (name, v) in enumerate(marked.items()):
-        mark(axes, frame(v), name, i, bool(result.contains(v)))
+        admissible = bool(result.contains(v))
+        mark(axes, frame(v), name, i, admissible)
     axes.grid(False)
-    axes.set(aspect="equal", xlim=(-1.22 * r, 1.22 * r), ylim=(-1.22 * r, 1.22 * r))
+    limits = (-1.22 * r, 1.22 * r)
+    axes.set(aspect="equal", xlim=limits, ylim=limits)
     axes.set_xlabel("kinetic coordinate $u_1$ [√J];  energy is $T^+ = T_c + |u|^2/2$")
     axes.set_ylabel("kinetic coordinate $u_2$ [√J]")
     legend_below(figure, 3)
@@ -159,9 +158,11 @@ class _TurnedCoordinates:
         self._set = result
         self._metric = result.axes.T @ dense_mass(result.scene)
         self.radius = result.coordinates.radius
-        normals = np.asarray(result.scene.normals, float)[:, closed].T @ result.axes
+        n = np.asarray(result.scene.normals, float)[:, closed]
+        normals = n.T @ result.axes
         push = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        up = push.sum(0) / np.linalg.norm(push.sum(0))
+        sum_of_pushes = push.sum(0)
+        up = sum_of_pushes / np.linalg.norm(sum_of_pushes)
         right = np.array([up[1], -up[0]])
         if right @ push[0] < 0:
             right = -right
@@ -169,14 +170,16 @@ class _TurnedCoordinates:
         self.push = push @ self._turn.T
         # perpendicular to push k, on the side to which the other impulse pushes
         walls = np.stack([[-p[1], p[0]] for p in self.push])
-        self.walls = walls * np.sign(np.sum(walls * self.push[::-1], axis=1))[:, None]
+        towards = np.sum(walls * self.push[::-1], axis=1)
+        self.walls = walls * np.sign(towards)[:, None]
         self.before = self(result.velocity)
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
         """Turned coordinates `u = R axes^T M (v - centre)` (..., 2) of velocities v
         (..., n).
         """
-        return (velocity - self._set.centre) @ self._metric.T @ self._turn.T
+        from_centre = velocity - self._set.centre
+        return from_centre @ self._metric.T @ self._turn.T
 
 
 def _draw_side(
@@ -193,13 +196,16 @@ def _draw_side(
     Equation: `|start + length direction| = r`, direction (2,) of length 1.
     """
     b = start @ direction
-    length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
+    square = b * b + frame.radius**2 - start @ start
+    length = -b + np.sqrt(max(square, 0.0))
     end = start + length * direction
     if length < _SHORTEST * frame.radius:
         return
-    axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
+    ends = np.stack([start, end])
+    axes.plot(*ends.T, color=GREY, lw=1.0, ls=style)
     # of the name, never upside down
-    angle = np.degrees(np.arctan2(direction[1], direction[0]))
+    x, y = direction
+    angle = np.degrees(np.arctan2(y, x))
     if angle > 90:
         angle = angle - 180
     elif angle < -90:
@@ -211,7 +217,8 @@ def _draw_side(
         share = 0.3
         side = "bottom"
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
-    write(axes, start + share * length * direction, text, color=GREY, **turned)
+    place = start + share * length * direction
+    write(axes, place, text, color=GREY, **turned)
 
 
 def _draw_projections(
@@ -228,10 +235,12 @@ def _draw_projections(
     samples = result.sample(0, _SAMPLES)
     norm = np.asarray(kinetic_norm(result.scene), float)
     # qn = unit^T v
-    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
+    normals = np.asarray(result.scene.normals, float)
+    unit = (normals / norm)[:, contacts]
     cloud = samples @ unit
     energies = _energy_ratio(result, samples)
-    pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
+    contacts_shown = range(len(contacts))
+    pairs = list(combinations(contacts_shown, 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8, title)
     energy = "energy ratio $T^+ / T^-$"
     for axes, (i, j) in zip(grid, pairs):
@@ -240,14 +249,16 @@ def _draw_projections(
             y = energies
         else:
             y = cloud[:, j]
-        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, lw=0, vmin=0, vmax=1)
+        scale = {"vmin": 0, "vmax": 1}
+        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, lw=0, **scale)
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
             if single:
                 height = _energy_ratio(result, v)
             else:
                 height = point[j]
-            mark(axes, (point[i], height), name, k, bool(result.contains(v)))
+            admissible = bool(result.contains(v))
+            mark(axes, (point[i], height), name, k, admissible)
         labels = [
             f"normalized gap velocity {contacts[c] + 1} after [√J]" for c in (i, j)
         ]
@@ -260,7 +271,8 @@ def _draw_projections(
 
 def _energy_ratio(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
     """T+ / T- (...,) of velocities (..., n)."""
-    energy = 0.5 * np.sum(velocity @ dense_mass(result.scene) * velocity, axis=-1)
+    momenta = velocity @ dense_mass(result.scene)
+    energy = 0.5 * np.sum(momenta * velocity, axis=-1)
     if result.energy:
         return energy / result.energy
     return np.ones_like(energy)
@@ -293,11 +305,8 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     theta = np.degrees(result.kinetic_angle)
     size = np.abs(result.dispersion)
     for j, axes in enumerate(panels):
-        axes.plot(
-            theta,
-            size[:, j],
-            label=[f"e = {e:g}" for e in np.asarray(result.restitution)],
-        )
+        labels = [f"e = {e:g}" for e in np.asarray(result.restitution)]
+        axes.plot(theta, size[:, j], label=labels)
     _critical_lines(panels, result)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     legend_below(figure, 6)
@@ -338,7 +347,8 @@ def rocking_outcomes(
     e = np.asarray(result.restitution)
     for j, axes in enumerate(panels):
         axes.grid(False)
-        axes.pcolormesh(theta, e, codes[:, j].T, shading="nearest", **coloured)
+        of_friction = codes[:, j].T
+        axes.pcolormesh(theta, e, of_friction, shading="nearest", **coloured)
     _critical_lines(panels, result)
     handles = [
         Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)
@@ -370,28 +380,24 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
             "Argument `domains` must hold at least one domain, but is empty."
         )
     default = "Admissible restitution matrices of a block"
+    heading = title or default
     figure, panels = new_panels(
-        len(domains), 3.2, 0.6, title or default, sharex=True, sharey=True
+        len(domains), 3.2, 0.6, heading, sharex=True, sharey=True
     )
     for axes, domain in zip(panels, domains):
-        axes.fill(
-            *domain.corners.T, color=_FILL, lw=0, label="free: both corners leave"
-        )
+        label = "free: both corners leave"
+        axes.fill(*domain.corners.T, color=_FILL, lw=0, label=label)
         axes.plot([0, 0], domain.rocking, color=COLOURS[0], lw=4, label="rocking")
         if domain.half_rocking is not None:
-            axes.plot(
-                domain.half_rocking,
-                [0, 0],
-                color=COLOURS[1],
-                lw=4,
-                label="half-rocking",
-            )
+            style = {"color": COLOURS[1], "lw": 4, "label": "half-rocking"}
+            axes.plot(domain.half_rocking, [0, 0], **style)
         if domain.sliding:
             way = "sliding"
         else:
             way = "sticking"
         axes.set_title(f"height / width {domain.aspect:g}, {way}")
-        axes.set(aspect="equal", xlim=(-0.05, 1.1), ylim=(-0.05, 1.1))
+        limits = (-0.05, 1.1)
+        axes.set(aspect="equal", xlim=limits, ylim=limits)
     _label_outer(panels, "restitution, corner that hits", "restitution, other corner")
     legend_below(figure, 3)
     return figure
@@ -401,9 +407,8 @@ def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, 
     """Figure and panels of rocking blocks, one for each mu, over the kinetic angle
     [degrees].
     """
-    figure, panels = new_panels(
-        len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True
-    )
+    count = len(result.friction)
+    figure, panels = new_panels(count, 2.8, 0.6, title, sharex=True, sharey=True)
     for axes, mu in zip(panels, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}")
     _label_outer(panels, r"kinetic angle $\theta_{12}$ [degrees]", label)
@@ -412,7 +417,8 @@ def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, 
 
 def _critical_lines(panels: np.ndarray, result: RockingDispersion) -> None:
     """Draw the critical kinetic angle of each mu as a dotted line in its panel."""
-    for axes, angle in zip(panels, np.degrees(critical_kinetic_angle(result.friction))):
+    critical = np.degrees(critical_kinetic_angle(result.friction))
+    for axes, angle in zip(panels, critical):
         axes.axvline(float(angle), color="black", ls=":", lw=1)
 
 

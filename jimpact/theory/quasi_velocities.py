@@ -100,9 +100,8 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
         "tangential", tangential, tangent.shape[1:], "one per tangent of `quasi_basis`"
     )
     # n_q G^-1 qn = M^-1 N p with p = G^-1 qn / |grad f|
-    impulse = jnp.linalg.solve(
-        as_matrix(normalized_delassus(scene)), qn
-    ) / kinetic_norm(scene)
+    g = as_matrix(normalized_delassus(scene))
+    impulse = jnp.linalg.solve(g, qn) / kinetic_norm(scene)
     return velocity_change(scene, impulse) + tangent @ qt
 
 
@@ -178,11 +177,9 @@ def contact_power(
         raise ValueError(
             "Argument `scene` must have tangents where tangential forces act."
         )
+    shape = scene.tangents.shape[1:]
     lambda_t = as_numbers(
-        "tangential_force",
-        tangential_force,
-        scene.tangents.shape[1:],
-        "one per tangent",
+        "tangential_force", tangential_force, shape, "one per tangent"
     )
     _, t_q = quasi_basis(scene)
     # M^-1 H lambda_t

@@ -79,18 +79,21 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     largest = jnp.abs(fixed).max()
     fixed = fixed / jnp.where(largest > 0, largest, 1.0)
     # all nonempty sets of indices, as rows of zeros and ones
-    supports = ((np.arange(1, 2**m)[:, None] >> np.arange(m)) & 1).astype(q.dtype)
+    numbers = np.arange(1, 2**m)[:, None]
+    supports = ((numbers >> np.arange(m)) & 1).astype(q.dtype)
     inside = supports[:, :, None] * supports[:, None, :]
     # above every eigenvalue of Q_SS, which are at most m
     outside = (m + 1.0) * (1 - supports)
-    blocks = (
-        inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
-    )
-    lowest = jnp.linalg.eigh(blocks)[1][:, :, 0] * supports
-    lowest = lowest * jnp.where(jnp.sum(lowest, axis=1) < 0, -1.0, 1.0)[:, None]
+    identity = jnp.eye(m, dtype=q.dtype)
+    blocks = inside * fixed[None] + outside[:, :, None] * identity[None]
+    _, vectors = jnp.linalg.eigh(blocks)
+    lowest = vectors[:, :, 0] * supports
+    signs = jnp.where(jnp.sum(lowest, axis=1) < 0, -1.0, 1.0)
+    lowest = lowest * signs[:, None]
     x = jnp.maximum(lowest, 0.0)
     x = x / jnp.linalg.norm(x, axis=1, keepdims=True)
-    best = x[jnp.argmin(jnp.einsum("si,ij,sj->s", x, fixed, x))]
+    values = jnp.einsum("si,ij,sj->s", x, fixed, x)
+    best = x[jnp.argmin(values)]
     return best @ q @ best, best
 
 
@@ -264,7 +267,8 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
     ... ).tolist()
     [[0.75, 0.0], [0.0, 0.0]]
     """
-    return jnp.linalg.inv(delassus) - matrix.T @ jnp.linalg.solve(delassus, matrix)
+    returned = matrix.T @ jnp.linalg.solve(delassus, matrix)
+    return jnp.linalg.inv(delassus) - returned
 
 
 @full_precision
@@ -316,22 +320,23 @@ def audit_matrix(
         tolerance = COPOSITIVITY_TOLERANCE.get(str(scene.mass.dtype), 1e-4)
     inverse = np.linalg.inv(g)
     q = inverse - e.T @ inverse @ e
-    scale = max(np.abs(inverse).max(), np.abs(e.T @ inverse @ e).max())
+    returned = np.abs(e.T @ inverse @ e).max()
+    scale = max(np.abs(inverse).max(), returned)
     energetic = copositivity(q, tolerance, scale)
     impulse = np.zeros(len(closed))
-    impulse[closed] = (
-        inverse @ -energetic.witness / np.asarray(kinetic_norm(scene), float)[closed]
-    )
+    norm = np.asarray(kinetic_norm(scene), float)[closed]
+    impulse[closed] = inverse @ -energetic.witness / norm
     # the v- without any motion along the contacts: v = M^-1 N p has qn = G pbar
-    worst = velocity_change(scene, jnp.asarray(impulse, scene.mass.dtype)) + 0.0
+    percussion = jnp.asarray(impulse, scene.mass.dtype)
+    worst = velocity_change(scene, percussion) + 0.0
     worst_normal = np.array(normalized_gap_velocity(scene, worst), float)
     worst_normal[closed] = 0.0 - energetic.witness
     skew = inverse @ e - (inverse @ e).T  # 0: E is self-adjoint
-    self_adjoint = np.abs(skew).max() <= tolerance * max(
-        np.abs(inverse @ e).max(), 1e-300
-    )
+    size = max(np.abs(inverse @ e).max(), 1e-300)
+    self_adjoint = np.abs(skew).max() <= tolerance * size
     if self_adjoint:
-        radius = float(np.abs(np.linalg.eigvals(e)).max())
+        eigenvalues = np.linalg.eigvals(e)
+        radius = float(np.abs(eigenvalues).max())
     else:
         radius = None
     return MatrixAudit(
@@ -373,8 +378,9 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
     0.25
     """
     change = as_numbers("jump", jump, (scene.size,), "one per coordinate of the scene")
+    shape: tuple[()] = ()
     e = as_numbers(
-        "restitution", restitution, (), "one for all contacts", low=0.0, high=1.0
+        "restitution", restitution, shape, "one for all contacts", low=0.0, high=1.0
     )
     return (1 - e) / (1 + e) * kinetic_energy(scene, change)
 
@@ -386,9 +392,8 @@ def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(
             "Argument `scene` must have a closed contact, but all gaps are open."
         )
-    return np.asarray(as_matrix(normalized_delassus(scene)), float)[
-        np.ix_(closed, closed)
-    ], closed
+    g = np.asarray(as_matrix(normalized_delassus(scene)), float)
+    return g[np.ix_(closed, closed)], closed
 
 
 def _check_independent(scene: Scene, g: np.ndarray) -> None:
@@ -396,7 +401,8 @@ def _check_independent(scene: Scene, g: np.ndarray) -> None:
     singular.
     """
     eigenvalues = np.linalg.eigvalsh(g)
-    floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * len(g) * eigenvalues[-1]
+    rounding = _SINGULAR * np.finfo(scene.mass.dtype).eps
+    floor = rounding * len(g) * eigenvalues[-1]
     if eigenvalues[0] <= floor:
         raise ValueError(
             f"Argument `scene` must have independent contacts, but its {len(g)} closed "
@@ -417,9 +423,8 @@ def _nonnegativity(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     velocity = np.zeros(len(closed))
     velocity[contact[at[1]]] = -1.0
     worst = float(a[at])
-    return Sign(
-        worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity
-    )
+    pair = (int(contact[at[0]]), int(contact[at[1]]))
+    return Sign(worst >= -tolerance, worst, pair, velocity)
 
 
 def _as_text(vector: np.ndarray) -> str:
@@ -487,11 +492,11 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
     Moreau's law with these coefficients: some impacts GAIN energy
     sufficient: 1 <= 0.3333: does not, which decides nothing
     """
-    e = as_numbers(
-        "restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts
-    )
+    m = scene.contacts
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=m)
     g, closed = _closed_delassus(scene)
-    each = np.broadcast_to(np.asarray(e, float), closed.shape)[closed]
+    of_contacts = np.broadcast_to(np.asarray(e, float), closed.shape)
+    each = of_contacts[closed]
     d = (1 - each) / (1 + each)
     weighted = d[:, None] * g  # D G
     low = float(d.min())

@@ -102,7 +102,8 @@ def rocking_matrix(restitution: Any) -> jax.Array:
     """
     ratio = "one ratio of angular velocities"
     e = as_numbers("restitution", restitution, (), ratio, low=0.0, high=1.0)
-    return e * jnp.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], e.dtype)
+    matrix = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+    return e * jnp.array(matrix, e.dtype)
 
 
 def rocking_ratios() -> list[RockingRatio]:
@@ -125,7 +126,8 @@ def rocking_ratios() -> list[RockingRatio]:
     concrete 3.0 0.8245
     """
     rows = (files("jimpact") / "data" / "rocking_ratio.csv").read_text(encoding="utf-8")
-    lines = [line.split(",") for line in rows.splitlines()[1:]]
+    below_header = rows.splitlines()[1:]
+    lines = [line.split(",") for line in below_header]
     return [
         RockingRatio(float(a), material, float(ratio)) for a, material, ratio in lines
     ]
@@ -183,9 +185,8 @@ class RockingDispersion(eqx.Module):
         # 0 none, 1 A only, 2 B only, 3 both
         codes = leaves[..., 1] + 2 * leaves[..., 0]
         unresolved = OUTCOMES.index("unresolved")
-        return np.where(
-            np.isnan(np.asarray(self.gap_velocity[..., 0])), unresolved, codes
-        )
+        failed = np.isnan(np.asarray(self.gap_velocity[..., 0]))
+        return np.where(failed, unresolved, codes)
 
     def __str__(self) -> str:
         """Report: for each mu the critical angle and the numbers of impacts of each
@@ -198,8 +199,10 @@ class RockingDispersion(eqx.Module):
             f"degrees ({len(theta)} shapes), {len(self.restitution)} e"
         ]
         for j, mu in enumerate(np.asarray(self.friction)):
-            counts = np.bincount(outcomes[:, j].ravel(), minlength=len(OUTCOMES))
-            shares = ", ".join(f"{n} {name}" for name, n in zip(OUTCOMES, counts) if n)
+            of_friction = outcomes[:, j].ravel()
+            counts = np.bincount(of_friction, minlength=len(OUTCOMES))
+            pairs = zip(OUTCOMES, counts)
+            shares = ", ".join(f"{n} {name}" for name, n in pairs if n)
             critical = float(np.degrees(critical_kinetic_angle(mu)))
             lines.append(
                 f"mu = {mu:g}: critical angle {critical:.2f} degrees; {shares}"
@@ -229,7 +232,8 @@ def rocking_kinetic_angle(aspect: Any) -> jax.Array:
     1.570796
     """
     a = as_numbers("aspect", aspect, low=0.0, open_low=True)
-    return jnp.arccos(-(a**2 - 2) / (a**2 + 4))
+    cosine = -(a**2 - 2) / (a**2 + 4)
+    return jnp.arccos(cosine)
 
 
 def critical_kinetic_angle(friction: Any) -> jax.Array:
@@ -263,7 +267,8 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     """
     mu = as_numbers("friction", friction, low=0.0)
     slips = jnp.minimum(mu, 0.5**0.5)  # beyond, B sticks
-    return rocking_kinetic_angle((jnp.sqrt(9 * slips**2 + 8) - 3 * slips) / 2)
+    root = jnp.sqrt(9 * slips**2 + 8)
+    return rocking_kinetic_angle((root - 3 * slips) / 2)
 
 
 class _BlockImpacts(NamedTuple):
@@ -289,13 +294,13 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> _BlockImpac
 
     def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> _BlockImpacts:
         """Outcome of one block, failures included."""
-        scene = Block(jnp.ones_like(a), a, jnp.ones_like(a), corners="base").scene()
-        before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
-        out = impact(
-            eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e)),
-            scene,
-            before,
-        )
+        unit = jnp.ones_like(a)
+        scene = Block(unit, a, unit, corners="base").scene()
+        sinks = jnp.full_like(a, -0.5)
+        turns = jnp.full_like(a, -1.0)
+        before = jnp.stack([a / 2, sinks, turns])
+        with_values = eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e))
+        out = impact(with_values, scene, before)
         after = out.velocity
         energy = (before**2 * scene.mass).sum() / 2
         return _BlockImpacts(
@@ -308,7 +313,8 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> _BlockImpac
 
     out = jax.vmap(one)(a, mu, e)
     failed = jnp.asarray(_FAILS)[out.status]
-    gamma = jnp.where(failed[:, None], jnp.nan, out.gap_velocity)
+    lost = failed[:, None]
+    gamma = jnp.where(lost, jnp.nan, out.gap_velocity)
     numbers = out.angular_ratio, out.slip_velocity, out.energy_ratio
     turn, slip, energy = (jnp.where(failed, jnp.nan, x) for x in numbers)
     return _BlockImpacts(gamma, turn, slip, energy, out.status)
@@ -364,7 +370,8 @@ def rocking_dispersion(
     cases = jnp.meshgrid(a, mu, e, indexing="ij")
     each_a, each_mu, each_e = (x.ravel() for x in cases)
     results = _impacts(each_a, each_mu, each_e, law)
-    on_grid = jax.tree.map(lambda x: x.reshape(cases[0].shape + x.shape[1:]), results)
+    shape = cases[0].shape
+    on_grid = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), results)
     return RockingDispersion(a, mu, e, **on_grid._asdict())
 
 
@@ -402,7 +409,8 @@ def search_critical_angle(
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0, open_low=True)
     law = LZB(1.0, stiffness, exponent, friction=0.0)
-    mus, es = (x.ravel() for x in jnp.meshgrid(mu, e, indexing="ij"))
+    grid = jnp.meshgrid(mu, e, indexing="ij")
+    mus, es = (x.ravel() for x in grid)
     low = jnp.full_like(mus, 0.5)
     high = jnp.full_like(mus, 2.0)
     for _ in range(_ZOOMS):
@@ -410,7 +418,8 @@ def search_critical_angle(
         each_mu, each_e = (jnp.repeat(x, _POINTS) for x in (mus, es))
         gamma = _impacts(a.reshape(-1), each_mu, each_e, law).gap_velocity
         size = jnp.abs(gamma[:, 1]).reshape(a.shape)  # |d| = |gamma_A+|
-        best = jnp.take_along_axis(a, jnp.nanargmin(size, axis=1)[:, None], 1)[:, 0]
+        place = jnp.nanargmin(size, axis=1)[:, None]
+        best = jnp.take_along_axis(a, place, 1)[:, 0]
         step = (high - low) / (_POINTS - 1)
         low = best - step
         high = best + step
@@ -437,9 +446,8 @@ class RockingDomain(NamedTuple):
         """
         a = np.asarray(own, float)
         b = np.asarray(cross, float)
-        inside: np.ndarray = (
-            (a >= 0) & (b >= 0) & (a + b <= 1) & (b >= self.coupling * (1 + a))
-        )
+        within = (a >= 0) & (b >= 0) & (a + b <= 1)
+        inside: np.ndarray = within & (b >= self.coupling * (1 + a))
         return inside
 
     @property
@@ -496,12 +504,15 @@ def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
     >>> domain.half_rocking, ji.theory.rocking_domain(2.0, sliding=False).rocking
     (None, (0.7, 1.0))
     """
-    a = float(as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True))
+    checked = as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True)
+    a = float(checked)
     if sliding:
         g = (a**2 - 2) / (a**2 + 4)
     else:
         g = float(housner_restitution(a))
     # a, b >= 0, a + b <= 1, cut by b = g (1 + a)
     wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
-    slender = [[0.0, g], [(1 - g) / (1 + g), 2 * g / (1 + g)], [0.0, 1.0]]
-    return RockingDomain(a, sliding, g, np.array(wide if g <= 0 else slender))
+    corner = [(1 - g) / (1 + g), 2 * g / (1 + g)]
+    slender = [[0.0, g], corner, [0.0, 1.0]]
+    corners = np.array(wide if g <= 0 else slender)
+    return RockingDomain(a, sliding, g, corners)
