@@ -170,25 +170,25 @@ class Bodies(RigidBodies):
                 "Argument `room` must be left out with `pairs` or `fixed`."
             )
         self.shapes = tuple(body.shapes[0] for body in every)
-        many = (
-            (room is not None or len(bodies) > FEW)
-            and not named
-            and self._may_be_many(d)
-        )
+        asked = room is not None or len(bodies) > FEW
+        many = asked and not named and self._may_be_many(d)
         if room is not None and not many:
-            names = ", ".join(sorted({type(body).__name__ for body in bodies}))
+            classes = {type(body).__name__ for body in bodies}
+            names = ", ".join(sorted(classes))
             raise TypeError(
                 f"Argument `bodies` must be discs, polygons or spheres, not {names}."
             )
         self.masses = _stacked([body.masses[0] for body in bodies])
-        self.inertias = _stacked(_alike([body.inertias[0] for body in bodies]))
+        inertias = _alike([body.inertias[0] for body in bodies])
+        self.inertias = _stacked(inertias)
         self.points = _stacked(_padded(every))
         self.rims = _stacked([body.rims[0] for body in every])
         self.planes = as_planes(planes, d).astype(self.points.dtype)
         self.room = 0
         self.pairs = None
         self.crowd = 0
-        self.places = as_float_array("places", places).reshape(-1, 3 if d == 2 else 7)
+        entries = 3 if d == 2 else 7
+        self.places = as_float_array("places", places).reshape(-1, entries)
         if many:
             if d == 3:
                 kinds = "spheres"
@@ -233,9 +233,11 @@ class Bodies(RigidBodies):
         and one with faces (polygon, box); two with faces.
         """
         if self.pairs is None:
-            each = np.stack(np.triu_indices(self.count, 1), axis=1).astype(np.int32)
+            every_pair = np.triu_indices(self.count, 1)
+            each = np.stack(every_pair, axis=1).astype(np.int32)
         else:
-            each = np.array(self.pairs, np.int32).reshape(-1, 2)
+            pairs = np.array(self.pairs, np.int32)
+            each = pairs.reshape(-1, 2)
         round_bodies = np.array([shape.is_round for shape in self.shapes])
         if round_bodies.all():  # of thousands there are millions of pairs
             return each, each[:0], each[:0]
@@ -243,21 +245,24 @@ class Bodies(RigidBodies):
         one_round = is_round.sum(axis=1) == 1
         mixed = each[one_round]
         first_is_round, _ = is_round[one_round].T
-        mixed = np.where(first_is_round[:, None], mixed, mixed[:, ::-1])
-        return each[is_round.all(axis=1)], mixed, each[~is_round.any(axis=1)]
+        swapped = mixed[:, ::-1]
+        mixed = np.where(first_is_round[:, None], mixed, swapped)
+        both_round = each[is_round.all(axis=1)]
+        both_faces = each[~is_round.any(axis=1)]
+        return both_round, mixed, both_faces
 
     def pairs_in_contact(self) -> np.ndarray:
         """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
         discs, mixed, faces = self._kinds
-        return np.concatenate(
-            [super().pairs_in_contact(), discs, mixed, np.repeat(faces, 2, axis=0)]
-        )
+        two_each = np.repeat(faces, 2, axis=0)
+        return np.concatenate([super().pairs_in_contact(), discs, mixed, two_each])
 
     def all_bodies(self, q: jax.Array) -> jax.Array:
         """Coordinates (b, ..) of each body, the fixed ones last."""
         if not len(self.places):
             return self.of_bodies(q)
-        return jnp.concatenate([self.of_bodies(q), self.places.astype(q.dtype)])
+        places = self.places.astype(q.dtype)
+        return jnp.concatenate([self.of_bodies(q), places])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps (m,), points and normals (m, ..) at q, and the bodies of each
@@ -270,7 +275,9 @@ class Bodies(RigidBodies):
         discs, mixed, faces = self._kinds
         if len(discs):
             i, j = discs.T
-            parts.append(round_on_round(points[i, 0], points[j, 0], rims[i], rims[j]))
+            first = points[i, 0]
+            second = points[j, 0]
+            parts.append(round_on_round(first, second, rims[i], rims[j]))
         if len(mixed):
             parts.append(self._round_on_faces(placed, *mixed.T))
         if len(faces):
@@ -289,10 +296,10 @@ class Bodies(RigidBodies):
             # body
             swapped = changed_places((a, b), at, sizes, facing)
             two_each = polygon_on_polygon(a, b, facing, swapped)  # (g, 2, ..)
-            parts.append(
-                ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in two_each))
-            )
-        return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
+            flat = (x.reshape(-1, *x.shape[2:]) for x in two_each)
+            parts.append(ContactPoints(*flat))
+        whole = (jnp.concatenate(rows) for rows in zip(*parts))
+        return ContactPoints(*whole)
 
     @property
     def _counts(self) -> np.ndarray:
@@ -314,15 +321,16 @@ class Bodies(RigidBodies):
         if self.dimension == 2:
             return disc_on_polygon(points[i, 0], rims[i], points[j])
         middle = 0.5 * (points[j, 0] + points[j, -1])
-        half = 0.5 * (self.points[j, -1] - self.points[j, 0])  # sizes of the boxes
+        diagonal = self.points[j, -1] - self.points[j, 0]
+        half = 0.5 * diagonal  # sizes of the boxes
         # in their axes
-        from_middle = times(jnp.swapaxes(turns[j], 1, 2), points[i, 0] - middle)
+        to_axes = jnp.swapaxes(turns[j], 1, 2)
+        from_middle = times(to_axes, points[i, 0] - middle)
         distance, n = from_box(from_middle, half)
         normal = times(turns[j], n)
         away = distance - rims[j]
-        return ContactPoints(
-            away - rims[i], points[i, 0] - away[:, None] * normal, normal
-        )
+        point = points[i, 0] - away[:, None] * normal
+        return ContactPoints(away - rims[i], point, normal)
 
     @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
@@ -386,7 +394,8 @@ class Bodies(RigidBodies):
         heights = jnp.sin(turn) * x + jnp.cos(turn) * y
         up = offset + self.rims[body] - jnp.min(heights)
         place = [n_y * distance + n_x * up, n_y * up - n_x * distance]
-        return jnp.stack([*place, turn + jnp.arctan2(-n_x, n_y)])
+        inclination = jnp.arctan2(-n_x, n_y)
+        return jnp.stack([*place, turn + inclination])
 
     # ---- many bodies: closed contacts only
 
@@ -455,9 +464,8 @@ class Bodies(RigidBodies):
         if below is None:
             below = _TOUCHING * float(grid.least_radius(self))
         check_values("below", below, low=0.0)
-        pairs, least = jax.device_get(
-            _active_pairs(self, q, jnp.asarray(below, q.dtype))
-        )
+        closed_below = jnp.asarray(below, q.dtype)
+        pairs, least = jax.device_get(_active_pairs(self, q, closed_below))
         if least < -float(self.overlap):
             warnings.warn(
                 f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals "
@@ -475,7 +483,8 @@ class Bodies(RigidBodies):
                 f"`room` of `Bodies`), but holds more."
             )
         listed = listed_pairs(pairs, self.mass)
-        if not listed.directions[:, 0].any(axis=(1, 2)).all():
+        moves = listed.directions[:, 0].any(axis=(1, 2))
+        if not moves.all():
             raise ValueError("Argument `q` must hold bodies with different centres.")
         return listed.scene
 
@@ -564,7 +573,8 @@ def _as_pairs(
     count = len(every)
     if pairs is None:
         ready = [i for i, shape in enumerate(shapes) if shape.faces or shape.is_round]
-        pairs = [(i, j) for i in ready for j in ready if i < j and i < moving]
+        ready_pairs = [(i, j) for i in ready for j in ready]
+        pairs = [(i, j) for i, j in ready_pairs if i < j and i < moving]
     for pair in pairs:
         if not (
             np.shape(pair) == (2,)

@@ -126,7 +126,9 @@ class Body(eqx.Module):
         """q' at velocities v (n,): the derivative of `nearby(q, u)` in u, at 0, along
         v.
         """
-        return jax.jvp(lambda u: self.nearby(q, u), (jnp.zeros_like(v),), (v,))[1]
+        at_rest = jnp.zeros_like(v)
+        _, rate = jax.jvp(lambda u: self.nearby(q, u), (at_rest,), (v,))
+        return rate
 
     @property
     def mass(self) -> Any:
@@ -188,15 +190,18 @@ class Body(eqx.Module):
                 return mass * v
             return mass @ v
 
-        change = jax.jvp(momentum, (q,), (v,))[1]
-        return 0.5 * jax.grad(lambda x: v @ momentum(x))(q) - change
+        _, change = jax.jvp(momentum, (q,), (v,))
+        gradient = jax.grad(lambda x: v @ momentum(x))(q)
+        return 0.5 * gradient - change
 
     def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
         """A `gradient` in q as one in the displacements u (n,): `(dq/du)^T gradient` at
         u = 0.
         """
-        zero = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
-        return jax.vjp(lambda u: self.nearby(q, u), zero)[1](gradient)[0]
+        velocities = self.mass_matrix(q).shape[:1]
+        zero = jnp.zeros(velocities, q.dtype)
+        _, pull = jax.vjp(lambda u: self.nearby(q, u), zero)
+        return pull(gradient)[0]
 
     def _gradient(
         self, function: Callable[[jax.Array], Any], q: jax.Array
@@ -204,8 +209,10 @@ class Body(eqx.Module):
         """Gradients (n, k) of q -> (k,) in displacements u, at 0; forward mode allows
         loops.
         """
-        zero = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
-        return jax.jacfwd(lambda u: function(self.nearby(q, u)))(zero).T
+        velocities = self.mass_matrix(q).shape[:1]
+        zero = jnp.zeros(velocities, q.dtype)
+        derivative = jax.jacfwd(lambda u: function(self.nearby(q, u)))
+        return derivative(zero).T
 
     @property
     def pair_count(self) -> int | None:
@@ -331,12 +338,15 @@ class Body(eqx.Module):
                 f">= 1 contacts of {type(self).__name__}, but it returns {f.shape}."
             )
         check_range("q", self, parts.margin)
-        noise = precision(f.dtype).noise * jnp.maximum(1.0, jnp.abs(q).max())
+        largest_coordinate = jnp.maximum(1.0, jnp.abs(q).max())
+        noise = precision(f.dtype).noise * largest_coordinate
         largest = jnp.maximum(closed_below, noise)  # gap that counts as closed
         check_penetration("q", f, largest)
-        gaps = jnp.where(f <= largest.astype(f.dtype), 0.0, f)  # NaN stays
+        closed = f <= largest.astype(f.dtype)
+        gaps = jnp.where(closed, 0.0, f)  # NaN stays
         fields = (parts.mass, parts.normals, parts.tangents, gaps)
-        return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), fields))
+        in_precision = jax.tree.map(lambda x: x.astype(f.dtype), fields)
+        return Scene(*in_precision)
 
     def scenes(self, q: Any, near: float = CLOSED_BELOW) -> list[Scene]:
         """Scenes at measured configurations q (K, d): the contacts that touch, no
@@ -370,14 +380,15 @@ class Body(eqx.Module):
         scenes = []
         gaps = each.gaps
         tangents = each.tangents
-        for k, closed in enumerate(gaps <= gaps.min(axis=1, keepdims=True) + near):
+        least = gaps.min(axis=1, keepdims=True)
+        for k, closed in enumerate(gaps <= least + near):
             closed_tangents = None
             if tangents is not None:
-                columns = np.repeat(closed, tangents.shape[2] // gaps.shape[1])
+                of_contact = tangents.shape[2] // gaps.shape[1]
+                columns = np.repeat(closed, of_contact)
                 closed_tangents = tangents[k][:, columns]
-            scenes.append(
-                Scene(each.mass[k], each.normals[k][:, closed], closed_tangents)
-            )
+            normals = each.normals[k][:, closed]
+            scenes.append(Scene(each.mass[k], normals, closed_tangents))
         return scenes
 
     def _parts(self, q: jax.Array) -> "Parts":
@@ -507,7 +518,8 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
                 c = jnp.zeros_like(row)
             else:
                 a, c = row
-            row = jnp.stack([-jnp.sin(a), jnp.cos(a), c])
+            normal = [-jnp.sin(a), jnp.cos(a)]
+            row = jnp.stack([*normal, c])
         if d == 2:
             angles = ", or an angle, or an angle and a distance, of each"
         else:
@@ -531,7 +543,8 @@ def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     square = dot(vectors, vectors)
     length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    return jnp.where(square > 0, length, 0.0), vectors / length[..., None]
+    unit = vectors / length[..., None]
+    return jnp.where(square > 0, length, 0.0), unit
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:

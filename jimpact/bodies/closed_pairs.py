@@ -40,7 +40,8 @@ def block(x: jax.Array, row: jax.Array) -> jax.Array:
 
 def with_block(x: jax.Array, values: jax.Array, row: jax.Array) -> jax.Array:
     """x (K, ...) with these values from this row on."""
-    return jax.lax.dynamic_update_slice_in_dim(x, values.astype(x.dtype), row, 0)
+    in_dtype = values.astype(x.dtype)
+    return jax.lax.dynamic_update_slice_in_dim(x, in_dtype, row, 0)
 
 
 class ActivePairs(NamedTuple):
@@ -78,12 +79,16 @@ def listed_pairs(pairs: ActivePairs, mass: jax.Array) -> ListedPairs:
     """
     velocities = pairs.directions.shape[3]  # of a body
     count = len(mass) // velocities
-    bodies = np.where(pairs.bodies == count, -1, pairs.bodies)[: int(pairs.filled)]
-    order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
+    with_walls = np.where(pairs.bodies == count, -1, pairs.bodies)
+    bodies = with_walls[: int(pairs.filled)]
+    number = pairs.number[: len(bodies)]
+    order = np.lexsort((number, bodies[:, 1] < 0))
     bodies = bodies[order]
     directions = np.array(pairs.directions)[order]
-    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]  # walls do not move
-    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, count)
+    moves = bodies[:, -1] >= 0  # walls do not
+    directions[:, :, -1] *= moves[:, None, None]
+    normals = jnp.asarray(directions[:, 0])
+    scene = sparse_scene(mass, normals, bodies, count)
     return ListedPairs(order, bodies, directions, scene)
 
 
@@ -97,5 +102,6 @@ def chosen_rows(
     (C,) is the number of chosen ones among the candidates 0 to c.
     """
     row = first + np.arange(BLOCK, dtype=np.int32)
-    place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)
+    found = jnp.searchsorted(so_far, row + 1)
+    place = jnp.minimum(found, so_far.size - 1)
     return row < count, place

@@ -33,7 +33,8 @@ def round_on_round(
     """
     length, n = lengths(a - b)
     gap = length - r - s
-    return ContactPoints(gap, b + (s + 0.5 * gap)[:, None] * n, n)
+    height = s + 0.5 * gap
+    return ContactPoints(gap, b + height[:, None] * n, n)
 
 
 def from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -44,13 +45,16 @@ def from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
     these is positive (negative inside); `|max(|x_i| - half_i, 0)|`, that from an edge
     or corner, elsewhere.
     """
-    sign = jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
+    signs = jnp.where(x < 0, -1.0, 1.0)
+    sign = signs.astype(x.dtype)
     beyond = sign * x - half
     face = jnp.argmax(beyond, axis=1)
     over_face = jnp.sum(beyond > 0, axis=1) < 2
     length, toward = lengths(jnp.maximum(beyond, 0.0))
-    n = jnp.where(over_face[:, None], jax.nn.one_hot(face, 3, dtype=x.dtype), toward)
-    return jnp.where(over_face, jnp.max(beyond, axis=1), length), sign * n
+    of_face = jax.nn.one_hot(face, 3, dtype=x.dtype)
+    n = jnp.where(over_face[:, None], of_face, toward)
+    distance = jnp.where(over_face, jnp.max(beyond, axis=1), length)
+    return distance, sign * n
 
 
 # ------------------------------------------------------------------------- polygons (g,
@@ -77,7 +81,9 @@ def outward(side: jax.Array) -> jax.Array:
     s = 0.
     """
     square = dot(side, side)[..., None]
-    turned = jnp.stack([side[..., -1], -side[..., 0]], axis=-1)
+    x = side[..., 0]
+    y = side[..., -1]
+    turned = jnp.stack([y, -x], axis=-1)
     return turned / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
@@ -94,9 +100,8 @@ def disc_on_polygon(
     # outside, its side or one of its ends is the nearest
     nearest = jnp.argmax(heights, axis=1)
     row = np.arange(len(corners))
-    away, _, n = _from_side(
-        middle, *(x[row, nearest] for x in (corners, side, normals))
-    )
+    at_nearest = (x[row, nearest] for x in (corners, side, normals))
+    away, _, n = _from_side(middle, *at_nearest)
     return ContactPoints(away - rim, middle - away[:, None] * n, n)
 
 
@@ -117,22 +122,21 @@ def _from_side(
     slack = PARALLEL * jnp.sqrt(square)
     beyond = (along < -slack) | (along > square + slack)
     # the nearer one
-    end = begin + jnp.where(along > square, 1.0, 0.0)[..., None] * side
+    share = jnp.where(along > square, 1.0, 0.0)
+    end = begin + share[..., None] * side
     length, toward = lengths(point - end)
     distance = jnp.where(beyond, length, dot(n, from_begin))
     beyond = beyond[..., None]
-    return (
-        distance,
-        jnp.where(beyond, 0.5 * (point + end), point),
-        jnp.where(beyond, toward, n),
-    )
+    contact = jnp.where(beyond, 0.5 * (point + end), point)
+    return distance, contact, jnp.where(beyond, toward, n)
 
 
 def _without_points(heights: jax.Array, normals: jax.Array) -> jax.Array:
     """Heights (.., k) over sides with these normals (.., k, 2); -inf over those without
     length.
     """
-    return jnp.where(jnp.any(normals != 0, axis=-1), heights, -jnp.inf)
+    has_length = jnp.any(normals != 0, axis=-1)
+    return jnp.where(has_length, heights, -jnp.inf)
 
 
 class Facing(NamedTuple):
@@ -147,7 +151,8 @@ def _at_side(is_chosen: jax.Array, values: jax.Array) -> jax.Array:
     """Entries (2, g, ..) of `values` (2, g, K, ..) at the one chosen side (2, g, K) a
     polygon.
     """
-    chosen = is_chosen.reshape(*is_chosen.shape, *[1] * (values.ndim - 3))
+    other_axes = [1] * (values.ndim - 3)
+    chosen = is_chosen.reshape(*is_chosen.shape, *other_axes)
     return jnp.sum(jnp.where(chosen, values, 0.0), axis=2)
 
 
@@ -162,12 +167,15 @@ def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
     both = jnp.stack([a, b])
     _, normals = sides(both)
     # (polygon, pair, corner of the other polygon, side)
-    heights = dot(both[::-1, :, :, None] - both[:, :, None], normals[:, :, None])
+    of_other = both[::-1, :, :, None]
+    heights = dot(of_other - both[:, :, None], normals[:, :, None])
     beyond = _without_points(jnp.min(heights, axis=2), normals)
     own = jnp.argmax(beyond, axis=2)
-    n = _at_side(jax.nn.one_hot(own, a.shape[1], dtype=bool), normals)
+    is_own = jax.nn.one_hot(own, a.shape[1], dtype=bool)
+    n = _at_side(is_own, normals)
     # side of the other polygon
-    opposite = jnp.argmin(dot(normals[::-1], n[:, :, None]), axis=2)
+    facing = dot(normals[::-1], n[:, :, None])
+    opposite = jnp.argmin(facing, axis=2)
     separation = jnp.max(beyond, axis=2)
     of_a, of_b = separation
     by_b = of_b > of_a + PARALLEL  # a side of b separates more
@@ -176,7 +184,8 @@ def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
     first = jnp.where(by_b, opposite_a, own_a)
     second = jnp.where(by_b, own_b, opposite_b)
     n_a, n_b = n
-    return Facing(first, second, jnp.where(by_b[:, None], -n_b, n_a))
+    normal = jnp.where(by_b[:, None], -n_b, n_a)
+    return Facing(first, second, normal)
 
 
 def polygon_on_polygon(
@@ -192,15 +201,19 @@ def polygon_on_polygon(
     """
     corners = jnp.stack([a, b])
     numbers = jnp.stack([facing.first, facing.second])
-    is_facing = jax.nn.one_hot(numbers, a.shape[1], dtype=bool)
-    ends = jnp.stack([corners, jnp.roll(corners, -1, axis=2)], axis=3)
+    count = a.shape[1]
+    is_facing = jax.nn.one_hot(numbers, count, dtype=bool)
+    next_corners = jnp.roll(corners, -1, axis=2)
+    ends = jnp.stack([corners, next_corners], axis=3)
     ends = _at_side(is_facing, ends)  # (body, pair, begin or end, x or y)
     begin = ends[:, :, 0]
     side = ends[:, :, -1] - begin
     # the ends of each body's side in the order of the contacts, against the other
     # body's side
-    reverse = jnp.stack([swapped, ~swapped])[:, :, None, None]
-    ends = jnp.where(reverse, ends[:, :, ::-1], ends)
+    both_swapped = jnp.stack([swapped, ~swapped])
+    reverse = both_swapped[:, :, None, None]
+    reversed_ends = ends[:, :, ::-1]
+    ends = jnp.where(reverse, reversed_ends, ends)
     others = (x[::-1, :, None] for x in (begin, side, outward(side)))
     gaps, points, normals = _from_side(ends, *others)  # (body, pair, contact, ..)
     gap_a, gap_b = gaps
@@ -208,11 +221,10 @@ def polygon_on_polygon(
     normal_a, normal_b = normals
     nearer = gap_a <= gap_b  # the end of the first side
     at_end = nearer[..., None]
-    return ContactPoints(
-        jnp.where(nearer, gap_a, gap_b),
-        jnp.where(at_end, point_a, point_b),
-        jnp.where(at_end, normal_a, -normal_b),
-    )
+    gap = jnp.where(nearer, gap_a, gap_b)
+    point = jnp.where(at_end, point_a, point_b)
+    normal = jnp.where(at_end, normal_a, -normal_b)
+    return ContactPoints(gap, point, normal)
 
 
 def changed_places(
@@ -240,7 +252,8 @@ def changed_places(
     direction = _CUT + (angle_of_normal - _CUT) % (2 * np.pi)
     number = jnp.zeros(len(direction), jnp.int32)
     # seen from the second polygon, the direction between both is turned by pi
-    each = zip(polygons, angles, counts, (facing.first, facing.second), (0.0, np.pi))
+    facing_sides_of_both = (facing.first, facing.second)
+    each = zip(polygons, angles, counts, facing_sides_of_both, (0.0, np.pi))
     for corners, angle, count, side, half_turn in each:
         number += jnp.minimum(side, count - 1).astype(jnp.int32)
         if (count % 2).any():
@@ -264,8 +277,10 @@ def _full_turns(
     angles = angle_in_plane(normals)  # (g, K)
     first = angles[:, 0]
     facing = angles[np.arange(len(angles)), side]
-    phi = angle + (first - angle) % (2 * np.pi) + (facing - first) % (2 * np.pi)
-    return jnp.round((direction - phi) / (2 * np.pi)).astype(jnp.int32)
+    to_first = (first - angle) % (2 * np.pi)
+    phi = angle + to_first + (facing - first) % (2 * np.pi)
+    turns = jnp.round((direction - phi) / (2 * np.pi))
+    return turns.astype(jnp.int32)
 
 
 def margin_of_places(
@@ -280,10 +295,10 @@ def margin_of_places(
     """
     a, b = polygons
     n = facing.normal[:, None]
-    distance = jnp.min(dot(b, n), axis=1) - jnp.max(dot(a, n), axis=1)
-    off = (
-        1 - dot(n[:, 0], jnp.array([[np.cos(_CUT), np.sin(_CUT)]], n.dtype)) - _NEAR_CUT
-    )
+    nearest_of_b = jnp.min(dot(b, n), axis=1)
+    distance = nearest_of_b - jnp.max(dot(a, n), axis=1)
+    cut = jnp.array([[np.cos(_CUT), np.sin(_CUT)]], n.dtype)
+    off = 1 - dot(n[:, 0], cut) - _NEAR_CUT
     return jnp.maximum(off, distance - _TOUCHING)
 
 
@@ -295,14 +310,17 @@ def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactP
     """
     # each pair is taken for two discs, two polygons, and a disc on a polygon: one of
     # these counts
-    discs = round_on_round(a[:, 0], b[:, 0], r, s)
-    polygons = polygon_on_polygon(a, b, facing_sides(a, b), jnp.zeros(len(a), bool))
+    middle_a = a[:, 0]
+    middle_b = b[:, 0]
+    discs = round_on_round(middle_a, middle_b, r, s)
+    not_swapped = jnp.zeros(len(a), bool)
+    polygons = polygon_on_polygon(a, b, facing_sides(a, b), not_swapped)
     first_is_disc = r[:, None] > 0
-    disc = jnp.where(first_is_disc, a[:, 0], b[:, 0])
-    mixed = disc_on_polygon(
-        disc, jnp.maximum(r, s), jnp.where(first_is_disc[..., None], b, a)
-    )
-    mixed = mixed._replace(normal=jnp.where(first_is_disc, 1.0, -1.0) * mixed.normal)
+    disc = jnp.where(first_is_disc, middle_a, middle_b)
+    polygon = jnp.where(first_is_disc[..., None], b, a)
+    mixed = disc_on_polygon(disc, jnp.maximum(r, s), polygon)
+    sign = jnp.where(first_is_disc, 1.0, -1.0)
+    mixed = mixed._replace(normal=sign * mixed.normal)
     any_disc = (r > 0) | (s > 0)
     both_discs = (r > 0) & (s > 0)
 
@@ -315,9 +333,12 @@ def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactP
         each = [1] * (of_discs.ndim - 1)
         is_disc = both_discs.reshape(-1, *each)
         with_disc = jnp.where(is_disc, of_discs, of_mixed)[:, None]
-        return jnp.where(any_disc.reshape(-1, 1, *each), with_disc, of_polygons)
+        with_one_disc = any_disc.reshape(-1, 1, *each)
+        return jnp.where(with_one_disc, with_disc, of_polygons)
 
-    gap, point, normal = (chosen(*x) for x in zip(discs, mixed, polygons))
+    kinds = zip(discs, mixed, polygons)
+    gap, point, normal = (chosen(*x) for x in kinds)
     # discs have one contact, polygons two
-    gap = gap.at[:, -1].add(jnp.where(any_disc, jnp.inf, 0.0))
+    never = jnp.where(any_disc, jnp.inf, 0.0)
+    gap = gap.at[:, -1].add(never)
     return ContactPoints(gap, point, normal)

@@ -112,7 +112,8 @@ def outer_radii(bodies: Pile) -> jax.Array:
 
     Equation: `R = max |c| + r`, c the points of a body, r its rim.
     """
-    far = jnp.sqrt(jnp.max(jnp.sum(bodies.points**2, axis=2), axis=1))
+    squares = jnp.sum(bodies.points**2, axis=2)
+    far = jnp.sqrt(jnp.max(squares, axis=1))
     return far + bodies.rims
 
 
@@ -123,10 +124,12 @@ def least_radius(bodies: Pile) -> jax.Array:
     Equation: `r - |c|` of a round body of radius r about its point c, of a polygon the
     distance of its nearest side.
     """
-    far = jnp.sqrt(jnp.sum(bodies.points[:, 0] ** 2, axis=1))
+    first_points = bodies.points[:, 0]
+    far = jnp.sqrt(jnp.sum(first_points**2, axis=1))
     if slots(bodies) == 1:
         return jnp.min(bodies.rims - far)
-    of_round = jnp.where(bodies.rims > 0, bodies.rims - far, jnp.inf)
+    inside = bodies.rims - far
+    of_round = jnp.where(bodies.rims > 0, inside, jnp.inf)
     return jnp.min(jnp.minimum(of_round, inner_radii(bodies.points)))
 
 
@@ -168,10 +171,13 @@ def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
     """
     n = bodies.planes[:, :-1]
     offset = bodies.planes[:, -1]
-    height = jnp.sum(bodies.placed(q).points[:, None] * n[None, :, None], axis=3)
-    gap = height - offset[None, :, None] - bodies.rims[:, None, None]
+    points = bodies.placed(q).points[:, None]
+    height = jnp.sum(points * n[None, :, None], axis=3)
+    above_planes = height - offset[None, :, None]
+    gap = above_planes - bodies.rims[:, None, None]
     sizes = np.array([shape.size for shape in bodies.shapes])
-    unused = np.arange(bodies.points.shape[1])[None] >= sizes[:, None]
+    number = np.arange(bodies.points.shape[1])
+    unused = number[None] >= sizes[:, None]
     return jnp.where(unused[:, None], jnp.inf, gap)
 
 
@@ -182,9 +188,8 @@ def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
     if bodies.crowd == 0:
         return all_pairs(bodies.count)
     distance = 2 * jnp.max(outer_radii(bodies)) + margin
-    return near_pairs(
-        bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd
-    )
+    centres = bodies.of_bodies(q)[:, : bodies.dimension]
+    return near_pairs(centres, distance, bodies.crowd)
 
 
 def _pair_contacts(
@@ -195,12 +200,14 @@ def _pair_contacts(
 
     `at` (b, ..) are the coordinates of all bodies; normals are towards body i.
     """
-    a, b = (bodies.placed_at(at[x], bodies.points[x]).points for x in (i, j))
+    placed = (bodies.placed_at(at[x], bodies.points[x]) for x in (i, j))
+    a, b = (body.points for body in placed)
     r = bodies.rims[i]
     s = bodies.rims[j]
     if slots(bodies) > 1:
         return any_pair(a, b, r, s)
-    return ContactPoints(*(x[:, None] for x in round_on_round(a[:, 0], b[:, 0], r, s)))
+    of_discs = round_on_round(a[:, 0], b[:, 0], r, s)
+    return ContactPoints(*(x[:, None] for x in of_discs))
 
 
 def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
@@ -209,7 +216,8 @@ def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
     If bodies near each other, or planes, have one up to `MARGIN` of the least radius,
     no other pair can have less; else all pairs are tested.
     """
-    others = jnp.asarray(np.arange(bodies.count, dtype=np.int32))
+    numbers = np.arange(bodies.count, dtype=np.int32)
+    others = jnp.asarray(numbers)
     to_planes = jnp.min(_plane_gaps(bodies, q), initial=jnp.inf)
     at = bodies.of_bodies(q)
 
@@ -220,22 +228,23 @@ def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
 
         def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
             """The least gap () with those of body i and every other one."""
-            gaps = _pair_contacts(bodies, at, jnp.full_like(others, i), others).gap
+            this = jnp.full_like(others, i)
+            gaps = _pair_contacts(bodies, at, this, others).gap
             itself = (others == i)[:, None]
-            return jnp.minimum(least, jnp.min(jnp.where(itself, jnp.inf, gaps)))
+            of_others = jnp.where(itself, jnp.inf, gaps)
+            return jnp.minimum(least, jnp.min(of_others))
 
-        return jax.lax.fori_loop(
-            jnp.int32(0), jnp.int32(bodies.count), with_one, to_planes
-        )
+        count = jnp.int32(bodies.count)
+        return jax.lax.fori_loop(jnp.int32(0), count, with_one, to_planes)
 
     if bodies.crowd == 0:
         return of_all_pairs()
     margin = MARGIN * least_radius(bodies)
     near = _near_gaps(bodies, q, q, margin)
-    least = jnp.minimum(jnp.min(near.gaps, initial=jnp.inf), to_planes)
-    return jax.lax.cond(
-        (least <= margin) & ~near.overflows, lambda: least, of_all_pairs
-    )
+    of_near = jnp.min(near.gaps, initial=jnp.inf)
+    least = jnp.minimum(of_near, to_planes)
+    sufficient = (least <= margin) & ~near.overflows
+    return jax.lax.cond(sufficient, lambda: least, of_all_pairs)
 
 
 class _NearGaps(NamedTuple):
@@ -258,17 +267,20 @@ def _near_gaps(
     Pairs from the grid are tested by the discs or balls around them; those of polygons
     that pass get the gaps of their sides, the least one at q and at `later`.
     """
-    displacement = jnp.abs(bodies.of_bodies(later - q)[:, : bodies.dimension])
+    of_places = bodies.of_bodies(later - q)[:, : bodies.dimension]
+    displacement = jnp.abs(of_places)
     # two bodies move by half of theirs from (q + later) / 2; larger ones are a
     # `coarse_step`
-    farther = jnp.minimum(
-        jnp.max(jnp.sum(displacement, axis=1)), MARGIN * least_radius(bodies)
-    )
+    farthest = jnp.max(jnp.sum(displacement, axis=1))
+    farther = jnp.minimum(farthest, MARGIN * least_radius(bodies))
     near = _candidates(bodies, 0.5 * (q + later), below + farther)
-    circles = [_circle_gaps(bodies, x, near.first, near.second) for x in (q, later)]
-    gaps = jnp.where(near.used, jnp.minimum(*circles), jnp.inf)
+    pair = (near.first, near.second)
+    circles = [_circle_gaps(bodies, x, *pair) for x in (q, later)]
+    least_of_both = jnp.minimum(*circles)
+    gaps = jnp.where(near.used, least_of_both, jnp.inf)
     if all(shape.centred for shape in bodies.shapes):
-        return _NearGaps(near.first, near.second, gaps[:, None], near.overflows)
+        column = gaps[:, None]
+        return _NearGaps(near.first, near.second, column, near.overflows)
     # pairs among the candidates 0 to c
     so_far = jnp.cumsum(gaps <= below, dtype=jnp.int32)
     rows = -(-NEAR * bodies.count // BLOCK) * BLOCK  # rounded up to whole blocks
@@ -278,15 +290,20 @@ def _near_gaps(
     def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
         """The arrays i, j, gaps with the rows of the block from row `first` on."""
         used, place = chosen_rows(so_far, first, count)
-        i, j = (jnp.where(used, x[place], 0) for x in (near.first, near.second))
-        both = jax.vmap(lambda at: _pair_contacts(bodies, at, i, j).gap)(at)
-        new = i, j, jnp.where(used[:, None], jnp.min(both, axis=0), jnp.inf)
+        bodies_of_pairs = (near.first, near.second)
+        i, j = (jnp.where(used, x[place], 0) for x in bodies_of_pairs)
+        gaps_at = jax.vmap(lambda at: _pair_contacts(bodies, at, i, j).gap)
+        both = gaps_at(at)
+        least = jnp.min(both, axis=0)
+        new = i, j, jnp.where(used[:, None], least, jnp.inf)
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
     none = jnp.zeros(rows, jnp.int32)
-    start: _Arrays = none, none, jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
+    unknown = jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
+    start: _Arrays = none, none, unknown
     i, j, gaps = over_blocks(count, fill_block, start)
-    return _NearGaps(i, j, gaps, near.overflows | (so_far[-1] > rows))
+    too_many = so_far[-1] > rows
+    return _NearGaps(i, j, gaps, near.overflows | too_many)
 
 
 def _closed(
@@ -300,18 +317,20 @@ def _closed(
     plane in turn.
     """
     near = _near_gaps(bodies, q, later, below)
-    to_planes = jnp.minimum(_plane_gaps(bodies, q), _plane_gaps(bodies, later)).reshape(
-        -1
-    )
+    at_both = jnp.minimum(_plane_gaps(bodies, q), _plane_gaps(bodies, later))
+    to_planes = at_both.reshape(-1)
     count = slots(bodies)
     partners = stride(bodies)
     slot = np.arange(count, dtype=np.int32)[None]
-    of_pairs = count * (near.first * partners + near.second)[:, None] + slot
+    pair = near.first * partners + near.second
+    of_pairs = count * pair[:, None] + slot
     partner = np.arange(bodies.count, partners, dtype=np.int32)
-    body = np.arange(bodies.count, dtype=np.int32)[:, None]
+    number = np.arange(bodies.count, dtype=np.int32)
+    body = number[:, None]
     at_planes = (count * (body * partners + partner)).reshape(-1)
     numbers = jnp.concatenate([of_pairs.reshape(-1), at_planes])
-    closed = jnp.concatenate([near.gaps.reshape(-1), to_planes]) <= below
+    gaps = jnp.concatenate([near.gaps.reshape(-1), to_planes])
+    closed = gaps <= below
     return numbers, closed, near.overflows
 
 
@@ -384,14 +403,19 @@ def _of_contacts(
     n = normals[row, slot]
     if len(bodies.planes):
         on_plane = (partner >= bodies.count)[:, None]
-        plane, corner = jnp.divmod(
-            jnp.maximum(partner - bodies.count, 0), jnp.int32(bodies.points.shape[1])
-        )
-        n = jnp.where(on_plane, bodies.planes[plane, :-1], n)
+        number_at_planes = jnp.maximum(partner - bodies.count, 0)
+        corners_each = jnp.int32(bodies.points.shape[1])
+        plane, corner = jnp.divmod(number_at_planes, corners_each)
+        normal = bodies.planes[plane, :-1]
+        n = jnp.where(on_plane, normal, n)
         corners = bodies.placed_at(at[i], bodies.points[i]).points
-        lowest = corners[row, corner] - bodies.rims[i][:, None] * n
+        rim = bodies.rims[i][:, None]
+        lowest = corners[row, corner] - rim * n
         point = jnp.where(on_plane, lowest, point)
-    along = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
+    normal_row = n[:, None]
+    along = jnp.concatenate([normal_row, tangents_of(n)], axis=1)
     jacobian = bodies.contact_jacobian
-    of_both = jacobian(at[i], point, along), -jacobian(at[other], point, along)
-    return i, jnp.minimum(partner, bodies.count), jnp.stack(of_both, axis=2)
+    of_first = jacobian(at[i], point, along)
+    of_both = of_first, -jacobian(at[other], point, along)
+    second = jnp.minimum(partner, bodies.count)
+    return i, second, jnp.stack(of_both, axis=2)

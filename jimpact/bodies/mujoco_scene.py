@@ -179,28 +179,10 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     0.8
     """
     mujoco = needed("mujoco", HOW)
-    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
-        raise TypeError(
-            f"Arguments `model` and `data` must be a mujoco.MjModel and its MjData, "
-            f"but are of types {type(model).__name__} and {type(data).__name__}."
-        )
-    if data.qpos.shape != (model.nq,) or data.qvel.shape != (model.nv,):
-        raise ValueError(
-            f"Argument `data` must be of this model, with {model.nq} positions and "
-            f"{model.nv} velocities, but has {data.qpos.size} and {data.qvel.size}."
-        )
+    _check_arguments(mujoco, model, data)
     check_values("margin", as_float_array("margin", margin), low=0.0)
-    check_values("data.qpos", data.qpos)
-    check_values("data.qvel", data.qvel)
     touching = _TOUCHING * model.stat.extent
-    model = copy.copy(model)
-    data = copy.copy(data)
-    model.geom_margin += margin + touching
-    model.pair_margin += margin + touching
-    for margins in (model.jnt_margin, model.tendon_margin):
-        margins += margin + touching
-    _grow_bounding_volumes(model, _BOUNDING * model.stat.extent)
-    mujoco.mj_fwdPosition(model, data)
+    model, data = _with_margin(mujoco, model, data, margin + touching)
     mass = _mass(mujoco, model, data)
     root = np.linalg.cholesky(mass)
     contacts, jacobians = _contacts(mujoco, model, data)
@@ -219,14 +201,15 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     )
     _warn_of_overlap(model, contacts, names)
     _warn_of_exceeded_limits(mujoco, model, data, limits)
-    jacobians = np.concatenate(
-        [jacobians, np.pad(ends[:, None], ((0, 0), (0, 2), (0, 0)))]
-    )
-    constraints = _independent(root, _rows_of(mujoco, model, data, _EQUALITIES)[1].T)
+    normals_alone = np.pad(ends[:, None], ((0, 0), (0, 2), (0, 0)))
+    jacobians = np.concatenate([jacobians, normals_alone])
+    _, gradients = _rows_of(mujoco, model, data, _EQUALITIES)
+    constraints = _independent(root, gradients.T)
     gaps = np.concatenate([[c.dist for c in contacts], distances])
     gaps = np.where(gaps > touching, gaps, 0.0)
     tangents = _tangents(root, jacobians[:, 1:])
-    sliding = np.pad(_friction(contacts, names), (0, len(limits)))
+    of_contacts = _friction(contacts, names)
+    sliding = np.pad(of_contacts, (0, len(limits)))
     if tangents is None:
         friction = None
     else:
@@ -241,7 +224,8 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
             gaps=gaps if gaps.any() else None,
             constraints=constraints if constraints.size else None,
         )
-    velocity = jnp.asarray(_admissible(root, constraints, np.array(data.qvel)))
+    measured = np.array(data.qvel)
+    velocity = jnp.asarray(_admissible(root, constraints, measured))
     return MujocoScene(scene, velocity, friction, names + limits)
 
 
@@ -263,6 +247,38 @@ def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
     for column, product in zip(columns, mass):
         mujoco.mj_mulM(model, data, product, column)
     return mass
+
+
+def _check_arguments(mujoco: ModuleType, model: Any, data: Any) -> None:
+    """Raise unless `data` is of this model, with finite positions and velocities."""
+    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+        raise TypeError(
+            f"Arguments `model` and `data` must be a mujoco.MjModel and its MjData, "
+            f"but are of types {type(model).__name__} and {type(data).__name__}."
+        )
+    shapes = data.qpos.shape, data.qvel.shape
+    if shapes != ((model.nq,), (model.nv,)):
+        raise ValueError(
+            f"Argument `data` must be of this model, with {model.nq} positions and "
+            f"{model.nv} velocities, but has {data.qpos.size} and {data.qvel.size}."
+        )
+    check_values("data.qpos", data.qpos)
+    check_values("data.qvel", data.qvel)
+
+
+def _with_margin(
+    mujoco: ModuleType, model: Any, data: Any, margin: float
+) -> tuple[Any, Any]:
+    """Copies of a model and its data; contacts and limits begin `margin` [m] off."""
+    model = copy.copy(model)
+    data = copy.copy(data)
+    model.geom_margin += margin
+    model.pair_margin += margin
+    for margins in (model.jnt_margin, model.tendon_margin):
+        margins += margin
+    _grow_bounding_volumes(model, _BOUNDING * model.stat.extent)
+    mujoco.mj_fwdPosition(model, data)
+    return model, data
 
 
 def _contacts(
@@ -315,9 +331,11 @@ def _tangents(root: np.ndarray, jacobians: np.ndarray) -> np.ndarray | None:
     (2, 2) with an eigenvalue that is not 0; `jacobians` J (m, 2, n) of (v_t1, v_t2);
     `root` L, `M = L L^T`.
     """
-    scaled = np.linalg.solve(root, np.swapaxes(jacobians, 1, 2))  # L^-1 J^T (m, n, 2)
+    columns = np.swapaxes(jacobians, 1, 2)
+    scaled = np.linalg.solve(root, columns)  # L^-1 J^T (m, n, 2)
     # increasing
-    mobility, directions = np.linalg.eigh(np.swapaxes(scaled, 1, 2) @ scaled)
+    delassus = np.swapaxes(scaled, 1, 2) @ scaled
+    mobility, directions = np.linalg.eigh(delassus)
     least = _IMMOBILE * mobility.max()
     if not (mobility[:, 1] > least).any():
         return None
@@ -363,12 +381,12 @@ def _rows_of(
     rows = np.flatnonzero(data.efc_type == getattr(mujoco.mjtConstraint, kind))
     gradients = np.zeros((rows.size, model.nv))
     if not mujoco.mj_isSparse(model):
-        gradients[:] = data.efc_J.reshape(-1, model.nv)[rows]
+        dense = data.efc_J.reshape(-1, model.nv)
+        gradients[:] = dense[rows]
         return rows, gradients
     for gradient, row in zip(gradients, rows):
-        entries = slice(
-            data.efc_J_rowadr[row], data.efc_J_rowadr[row] + data.efc_J_rownnz[row]
-        )
+        first = data.efc_J_rowadr[row]
+        entries = slice(first, first + data.efc_J_rownnz[row])
         gradient[data.efc_J_colind[entries]] = data.efc_J[entries]
     return rows, gradients
 
@@ -388,10 +406,8 @@ def _limits(
         rows, rows_of_kind = _rows_of(mujoco, model, data, kind)
         for row in rows:
             number = int(data.efc_id[row])
-            name = (
-                mujoco.mj_id2name(model, getattr(mujoco.mjtObj, object_type), number)
-                or number
-            )
+            kind_of_object = getattr(mujoco.mjtObj, object_type)
+            name = mujoco.mj_id2name(model, kind_of_object, number) or number
             names.append(f"limit of {word} {name}")
         gradients.append(rows_of_kind)
         distances.append(data.efc_pos[rows])
@@ -405,9 +421,8 @@ def _independent(root: np.ndarray, gradients: np.ndarray) -> np.ndarray:
     Equation: `h = L U` with the singular vectors U of `L^-1 G = U S V^T`; `root` L,
     `M = L L^T`.
     """
-    vectors, sizes, _ = np.linalg.svd(
-        np.linalg.solve(root, gradients), full_matrices=False
-    )
+    scaled = np.linalg.solve(root, gradients)
+    vectors, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
     return root @ vectors[:, sizes > _REPEATED * sizes.max(initial=0.0)]
 
 
@@ -423,7 +438,8 @@ def _admissible(
     scaled = root.T @ velocity
     basis = np.linalg.solve(root, constraints)  # L^-1 h, orthonormal
     broken = basis @ (basis.T @ scaled)
-    if np.linalg.norm(broken) > _DRIFT * np.linalg.norm(scaled):
+    drift = np.linalg.norm(broken)
+    if drift > _DRIFT * np.linalg.norm(scaled):
         warnings.warn(
             f"The velocity breaks equality constraints of the model; "
             f"{broken @ broken / (scaled @ scaled):.1%} of the kinetic energy is left "
@@ -468,9 +484,8 @@ def _warn_of_exceeded_limits(
     reached.
     """
     turning = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)
-    rows = np.concatenate(
-        [_rows_of(mujoco, model, data, kind)[0] for kind, _, _ in _LIMITS]
-    )
+    of_kinds = [_rows_of(mujoco, model, data, kind)[0] for kind, _, _ in _LIMITS]
+    rows = np.concatenate(of_kinds)
     beyond = []
     for row, name in zip(rows.astype(int), limits):
         is_joint = data.efc_type[row] == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT

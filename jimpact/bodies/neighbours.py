@@ -30,8 +30,10 @@ class Candidates(NamedTuple):
 
 def all_pairs(count: int) -> Candidates:
     """Every pair of `count` points."""
-    first, second = (jnp.asarray(x, jnp.int32) for x in np.triu_indices(count, 1))
-    return Candidates(first, second, jnp.ones_like(first, bool), jnp.asarray(False))
+    every_pair = np.triu_indices(count, 1)
+    first, second = (jnp.asarray(x, jnp.int32) for x in every_pair)
+    used = jnp.ones_like(first, bool)
+    return Candidates(first, second, used, jnp.asarray(False))
 
 
 def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates:
@@ -70,17 +72,16 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
     order = jnp.argsort(own).astype(jnp.int32)
     numbers = own[order]
     # place of each point in this order
-    place = (
-        jnp.zeros(count, jnp.int32).at[order].set(jnp.arange(count, dtype=jnp.int32))
-    )
+    ranks = jnp.arange(count, dtype=jnp.int32)
+    place = jnp.zeros(count, jnp.int32).at[order].set(ranks)
     begin = []
     end = []
-    for row in itertools.product((-1, 0, 1), repeat=d - 1):
+    rows_around = itertools.product((-1, 0, 1), repeat=d - 1)
+    for row in rows_around:
         if row < (0,) * (d - 1):
             continue  # points of these rows are paired with those of this one
-        low, high = (
-            number(cell + np.array([[*row, last]], np.int32)) for last in (-1, 1)
-        )
+        shifts = (np.array([[*row, last]], np.int32) for last in (-1, 1))
+        low, high = (number(cell + shift) for shift in shifts)
         own_row = not any(row)
         begin.append(
             place + 1 if own_row else jnp.searchsorted(numbers, low, side="left")
@@ -90,18 +91,16 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
     starts = jnp.stack(begin, axis=1)
     ends = jnp.stack(end, axis=1)
     # (k, rows, crowd)
-    at = starts[:, :, None] + np.arange(crowd, dtype=np.int32)[None, None]
+    offset = np.arange(crowd, dtype=np.int32)
+    at = starts[:, :, None] + offset[None, None]
     used = at < ends[:, :, None]
     other = order[jnp.minimum(at, count - 1)]
-    point = jnp.broadcast_to(
-        np.arange(count, dtype=np.int32)[:, None, None], other.shape
-    )
-    return Candidates(
-        jnp.minimum(point, other).reshape(-1),
-        jnp.maximum(point, other).reshape(-1),
-        used.reshape(-1),
-        jnp.any(ends - starts > crowd),
-    )
+    own_number = np.arange(count, dtype=np.int32)[:, None, None]
+    point = jnp.broadcast_to(own_number, other.shape)
+    first = jnp.minimum(point, other).reshape(-1)
+    second = jnp.maximum(point, other).reshape(-1)
+    overflows = jnp.any(ends - starts > crowd)
+    return Candidates(first, second, used.reshape(-1), overflows)
 
 
 def crowd_of(least: float, largest: float, d: int) -> int:
@@ -114,5 +113,7 @@ def crowd_of(least: float, largest: float, d: int) -> int:
     one more for bodies that overlap a little.
     """
     ratio = largest / least
-    density = {2: np.sqrt(4 / 3), 3: np.sqrt(2)}[d]  # D s^d / V
-    return int(density * (3 * ratio + 1) * (ratio + 1) ** (d - 1)) + 1
+    densities = {2: np.sqrt(4 / 3), 3: np.sqrt(2)}
+    density = densities[d]  # D s^d / V
+    of_rows = density * (3 * ratio + 1)
+    return int(of_rows * (ratio + 1) ** (d - 1)) + 1

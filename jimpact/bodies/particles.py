@@ -62,23 +62,22 @@ class Corner(Body):
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = m g y`."""
-        return LinearPotential(
-            self.mass * jnp.array([0.0, 1.0], self.mass.dtype) * acceleration
-        )
+        upwards = jnp.array([0.0, 1.0], self.mass.dtype)
+        return LinearPotential(self.mass * upwards * acceleration)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Distances f (2,) [m] from wall 1 and from wall 2, see the class."""
-        return jnp.stack(
-            [q[1], q[0] * jnp.sin(self.angle) - q[1] * jnp.cos(self.angle)]
-        )
+        x, y = q
+        from_second = x * jnp.sin(self.angle) - y * jnp.cos(self.angle)
+        return jnp.stack([y, from_second])
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
         """Positions (2,) [m] along the walls: `x`, and
         `x cos(angle) + y sin(angle)`.
         """
-        return jnp.stack(
-            [q[0], q[0] * jnp.cos(self.angle) + q[1] * jnp.sin(self.angle)]
-        )
+        x, y = q
+        along_second = x * jnp.cos(self.angle) + y * jnp.sin(self.angle)
+        return jnp.stack([x, along_second])
 
     def touching(self) -> jax.Array:
         """q (2,) in the corner."""
@@ -131,7 +130,8 @@ class Column(Body):
     @property
     def base_directions(self) -> jax.Array:
         """The floor moves vertically (n, 1)."""
-        return jnp.ones((self.masses.shape[0], 1), self.masses.dtype)
+        bodies = self.masses.shape[0]
+        return jnp.ones((bodies, 1), self.masses.dtype)
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = g sum m_i q_i`."""
@@ -139,7 +139,8 @@ class Column(Body):
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f (n,) [m] to the floor and between neighbours, see the class."""
-        top_below = jnp.concatenate([jnp.zeros(1, q.dtype), (q + self.radii)[:-1]])
+        tops = q + self.radii
+        top_below = jnp.concatenate([jnp.zeros(1, q.dtype), tops[:-1]])
         return q - self.radii - top_below
 
     def touching(self) -> jax.Array:

@@ -74,7 +74,8 @@ class PendulumCradle(Body):
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f (n - 1,) [m] between neighbouring balls, see the class."""
         touching = self.radius[:-1] + self.radius[1:]
-        right = touching + self.gaps + self.length * jnp.diff(jnp.sin(q))
+        displacement = jnp.diff(jnp.sin(q))
+        right = touching + self.gaps + self.length * displacement
         up = self.length * jnp.diff(jnp.cos(q))
         # with the centres' distance c = (right, up) and d = touching, |c| - d as
         # (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
@@ -88,14 +89,17 @@ class PendulumCradle(Body):
         i, j = np.triu_indices(self.masses.shape[0], 2)
         if not len(i):
             return super().valid(q)
-        between = self.radius[:-1] + self.radius[1:] + self.gaps
-        suspensions = jnp.concatenate(
-            [jnp.zeros_like(between[:1]), jnp.cumsum(between)]
-        )
+        touching = self.radius[:-1] + self.radius[1:]
+        between = touching + self.gaps
+        first = jnp.zeros_like(between[:1])
+        suspensions = jnp.concatenate([first, jnp.cumsum(between)])
         right = suspensions + self.length * jnp.sin(q)
         up = self.length * jnp.cos(q)
-        apart = jnp.sqrt((right[i] - right[j]) ** 2 + (up[i] - up[j]) ** 2)
-        return jnp.min(apart - self.radius[i] - self.radius[j])
+        across = right[i] - right[j]
+        rise = up[i] - up[j]
+        apart = jnp.sqrt(across**2 + rise**2)
+        gaps = apart - self.radius[i] - self.radius[j]
+        return jnp.min(gaps)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -118,12 +122,16 @@ class PendulumCradle(Body):
         length = float(self.length)
         radius = np.asarray(self.radius)
         # distances of suspensions
-        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
+        touching = radius[:-1] + radius[1:]
+        between = touching + np.asarray(self.gaps)
         curves = []
-        for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
+        suspensions = np.cumsum([0.0, *between])
+        for x, r, angle in zip(suspensions, radius, q):
             pivot = np.array([x, 0.0])
-            centre = pivot + length * np.array([np.sin(angle), -np.cos(angle)])
-            curves.append([np.stack([pivot, centre]), centre + r * CIRCLE])
+            direction = np.array([np.sin(angle), -np.cos(angle)])
+            centre = pivot + length * direction
+            string = np.stack([pivot, centre])
+            curves.append([string, centre + r * CIRCLE])
         return curves
 
 

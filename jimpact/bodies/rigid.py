@@ -183,32 +183,36 @@ class RigidBodies(Body):
         planes.
         """
         orders = [shape.order for shape in self.shapes[: self.count]]
-        return np.repeat(
-            np.arange(len(orders)), [len(x) for x in orders]
-        ), np.concatenate(orders)
+        bodies = np.arange(len(orders))
+        counts = [len(x) for x in orders]
+        return np.repeat(bodies, counts), np.concatenate(orders)
 
     def pairs_in_contact(self) -> np.ndarray:
         """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
-        body = np.tile(self.rows()[0].astype(np.int32), len(self.planes))
-        return np.stack([body, np.full_like(body, -1)], axis=1)
+        of_points, _ = self.rows()
+        body = np.tile(of_points.astype(np.int32), len(self.planes))
+        plane = np.full_like(body, -1)
+        return np.stack([body, plane], axis=1)
 
     @property
     def between(self) -> tuple[tuple[int, int], ...]:
         """Bodies (i, j) of each contact; j of a plane is -1."""
-        return tuple((i, j) for i, j in self.pairs_in_contact().tolist())
+        pairs = self.pairs_in_contact().tolist()
+        return tuple((i, j) for i, j in pairs)
 
     # ---- mass and coordinates
 
     @property
     def mass(self) -> jax.Array:
         """M = diag(m, .., m, I) of each body in turn: its diagonal (n,), or (n, n)."""
-        masses = jnp.broadcast_to(self.masses[:, None], (self.count, self.dimension))
+        shape = (self.count, self.dimension)
+        masses = jnp.broadcast_to(self.masses[:, None], shape)
         if self.inertias.ndim == 2:
-            return jnp.concatenate([masses, self.inertias], axis=1).reshape(-1)
+            of_bodies = jnp.concatenate([masses, self.inertias], axis=1)
+            return of_bodies.reshape(-1)
         each = zip(masses, self.inertias)
-        return jax.scipy.linalg.block_diag(
-            *(block for m, i in each for block in (jnp.diag(m), i))
-        )
+        blocks = (block for m, i in each for block in (jnp.diag(m), i))
+        return jax.scipy.linalg.block_diag(*blocks)
 
     @full_precision
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
@@ -222,9 +226,9 @@ class RigidBodies(Body):
             spin = self.inertias * omega
         else:
             spin = times(self.inertias, omega)
-        return jnp.concatenate(
-            [jnp.zeros_like(omega), -cross(omega, spin)], axis=1
-        ).reshape(-1)
+        torque = -cross(omega, spin)
+        by_body = jnp.concatenate([jnp.zeros_like(omega), torque], axis=1)
+        return by_body.reshape(-1)
 
     def valid(self, q: jax.Array) -> jax.Array:
         """Margin () of the quaternions' lengths: `UNIT_WITHIN - max | |e| - 1 |`."""
@@ -245,7 +249,8 @@ class RigidBodies(Body):
             return q + u
         half = 0.5 * turning_of(self.of_bodies(u))
         cosine, ratio = _cosine_and_sine_ratio(dot(half, half)[:, None])
-        return self._turned(q, u, jnp.concatenate([cosine, ratio * half], axis=1))
+        turn = jnp.concatenate([cosine, ratio * half], axis=1)
+        return self._turned(q, u, turn)
 
     @full_precision
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
@@ -260,7 +265,8 @@ class RigidBodies(Body):
             return q + u
         half = 0.5 * turning_of(self.of_bodies(u))
         scalar = 1 - 0.5 * dot(half, half)[:, None]
-        return self._turned(q, u, jnp.concatenate([scalar, half], axis=1))
+        turn = jnp.concatenate([scalar, half], axis=1)
+        return self._turned(q, u, turn)
 
     def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
         """q moved by the places of u (n,), with quaternions `e f / |e|`, f = `turn` (b,
@@ -271,9 +277,11 @@ class RigidBodies(Body):
         u = self.of_bodies(u)
         _, e = lengths(quaternion_of(q))
         # sum_jk table_ijk e_j f_k
-        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
+        by_turn = jnp.tensordot(turn, table, (1, 2))
+        product = dot(by_turn, e[:, None])
         place = place_of(q) + place_of(u)
-        return jnp.concatenate([place, product], axis=1).reshape(-1)
+        by_body = jnp.concatenate([place, product], axis=1)
+        return by_body.reshape(-1)
 
     @property
     def base_directions(self) -> jax.Array:
@@ -281,9 +289,8 @@ class RigidBodies(Body):
         axis.
         """
         d = self.dimension
-        return jnp.tile(
-            jnp.eye(d + self.angular, d, dtype=self.masses.dtype), (self.count, 1)
-        )
+        of_body = jnp.eye(d + self.angular, d, dtype=self.masses.dtype)
+        return jnp.tile(of_body, (self.count, 1))
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """Potential `V = g sum m_i h_i` [J], h the height: y in the plane, z in space
@@ -296,7 +303,8 @@ class RigidBodies(Body):
             size = d + self.angular
         # h among a body's coordinates
         up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)
-        return LinearPotential((self.masses[:, None] * up).reshape(-1) * acceleration)
+        weights = (self.masses[:, None] * up).reshape(-1)
+        return LinearPotential(weights * acceleration)
 
     # ---- positions and velocities of points
 
@@ -307,11 +315,13 @@ class RigidBodies(Body):
         if self.quaternions:
             return rotation(quaternion_of(at))
         if self.dimension == 3:  # spheres of a pile: their turns do not matter
-            return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (*at.shape[:-1], 3, 3))
+            identity = jnp.eye(3, dtype=at.dtype)
+            return jnp.broadcast_to(identity, (*at.shape[:-1], 3, 3))
         theta = at[..., -1]
         c = jnp.cos(theta)
         s = jnp.sin(theta)
-        return jnp.stack([c, -s, s, c], axis=-1).reshape(*c.shape, 2, 2)
+        entries = jnp.stack([c, -s, s, c], axis=-1)
+        return entries.reshape(*c.shape, 2, 2)
 
     def placed(self, q: jax.Array) -> Placed:
         """Orientations and points of all bodies at q, in a `Bodies` the fixed ones
@@ -349,9 +359,11 @@ class RigidBodies(Body):
         rim = self.rims[body]
         shape = (len(self.planes), *points.shape)
         n = jnp.broadcast_to(self.plane_normals[:, None], shape)
-        gap = jnp.sum(n * points[None], axis=2) - self.planes[:, d:] - rim[None]
+        height = jnp.sum(n * points[None], axis=2)
+        gap = height - self.planes[:, d:] - rim[None]
         point = points[None] - rim[None, :, None] * n
-        return ContactPoints(gap.reshape(-1), point.reshape(-1, d), n.reshape(-1, d))
+        flat_point = point.reshape(-1, d)
+        return ContactPoints(gap.reshape(-1), flat_point, n.reshape(-1, d))
 
     @full_precision
     def gap_function(self, q: jax.Array) -> jax.Array:
@@ -376,10 +388,10 @@ class RigidBodies(Body):
         gap, point, normal = self.contacts(q)
         directions = normal[:, None]
         if not with_tangents:
-            return Directions(
-                gap, self._relative_jacobian(q, point, directions)[..., 0], None
-            )
-        directions = jnp.concatenate([directions, self.unit_tangents(normal)], axis=1)
+            normals = self._relative_jacobian(q, point, directions)[..., 0]
+            return Directions(gap, normals, None)
+        tangents = self.unit_tangents(normal)
+        directions = jnp.concatenate([directions, tangents], axis=1)
         jacobian = self._relative_jacobian(q, point, directions)
         along_tangents = jacobian[..., 1:].reshape(len(jacobian), -1)
         return Directions(gap, jacobian[..., 0], along_tangents)
@@ -403,7 +415,8 @@ class RigidBodies(Body):
             point: (.., d) [m].
             directions: unit vectors d_k (.., k, d).
         """
-        lever = (point - at[..., : self.dimension])[..., None, :]
+        place = at[..., : self.dimension]
+        lever = (point - place)[..., None, :]
         along = directions
         if self.dimension == 2:
             around = (lever[..., 0] * along[..., 1] - lever[..., 1] * along[..., 0])[
@@ -611,7 +624,8 @@ class RigidBodies(Body):
             plane = np.array([0.0, 0, 1, 0])
         *normal, distance = plane
         height = curve @ normal - distance
-        return [projected(curve), projected(curve - np.outer(height, normal))]
+        shadow = curve - np.outer(height, normal)
+        return [projected(curve), projected(shadow)]
 
 
 class RigidBody(RigidBodies):
@@ -651,7 +665,8 @@ class RigidBody(RigidBodies):
     @property
     def corners(self) -> jax.Array:
         """Its contact points (k, d), in order, from the centre of mass [m]."""
-        return self.points[0, np.array(self.shapes[0].order)]
+        order = np.array(self.shapes[0].order)
+        return self.points[0, order]
 
     @property
     def radius(self) -> jax.Array:
@@ -678,9 +693,8 @@ class RigidBody(RigidBodies):
         if self.dimension == 2:
             return tangents_of(normal)
         x, y, z = normal.T
-        first = (
-            jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
-        )
+        across = jnp.stack([z, 0 * y, 0 * y - x], axis=1)
+        first = across / jnp.sqrt(x**2 + z**2)[:, None]
         return jnp.stack([first, cross(normal, first)], axis=1)
 
     def at(self, position: Any, turn: Any = None) -> jax.Array:
@@ -730,10 +744,13 @@ def rotation(e: jax.Array) -> jax.Array:
     s = e[..., 0, None, None]
     a = _vector_of(e)
     square = dot(e, e)[..., None, None]
-    across = jnp.tensordot(a, -_CROSS.astype(e.dtype), (-1, 2))  # [a]x
+    table = -_CROSS.astype(e.dtype)
+    across = jnp.tensordot(a, table, (-1, 2))  # [a]x
     outer = a[..., :, None] * a[..., None, :]
-    one = jnp.broadcast_to(jnp.eye(3, dtype=e.dtype), across.shape)
-    return one + 2 * (s * across + outer - dot(a, a)[..., None, None] * one) / square
+    identity = jnp.eye(3, dtype=e.dtype)
+    one = jnp.broadcast_to(identity, across.shape)
+    a_squared = dot(a, a)[..., None, None]
+    return one + 2 * (s * across + outer - a_squared * one) / square
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -745,7 +762,8 @@ def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
     x = jnp.where(small, square, 0.0)
     cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
     ratio = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))))
-    return jnp.where(small, cosine, jnp.cos(a)), jnp.where(small, ratio, jnp.sin(a) / a)
+    sine_ratio = jnp.where(small, ratio, jnp.sin(a) / a)
+    return jnp.where(small, cosine, jnp.cos(a)), sine_ratio
 
 
 @full_precision
@@ -753,9 +771,9 @@ def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Vector products `a x b` (.., 3), in fewer operations to compile than
     `jnp.cross`.
     """
-    return jnp.sum(
-        a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1
-    )
+    table = _CROSS.astype(b.dtype)
+    matrix = jnp.tensordot(b, table, (-1, 2))
+    return jnp.sum(a[..., None, :] * matrix, axis=-1)
 
 
 def tangents_of(normal: jax.Array) -> jax.Array:
@@ -765,15 +783,18 @@ def tangents_of(normal: jax.Array) -> jax.Array:
     `a - (a . n) n` with a fixed a, `t_2 = n x t_1`.
     """
     if normal.shape[1] == 2:
-        return jnp.stack([normal[:, 1], -normal[:, 0]], axis=1)[:, None]
+        x, y = normal.T
+        return jnp.stack([y, -x], axis=1)[:, None]
     aside = jnp.asarray(_ASIDE, normal.dtype)[None]
-    _, first = lengths(aside - dot(aside, normal)[:, None] * normal)
+    along = dot(aside, normal)[:, None] * normal
+    _, first = lengths(aside - along)
     return jnp.stack([first, cross(normal, first)], axis=1)
 
 
 def times(matrices: jax.Array, vectors: jax.Array) -> jax.Array:
     """Matrices (.., d, d) times vectors (.., d)."""
-    return jnp.sum(matrices * vectors[..., None, :], axis=-1)
+    terms = matrices * vectors[..., None, :]
+    return jnp.sum(terms, axis=-1)
 
 
 @jax.jit  # operation by operation JAX would compile thirty programs
@@ -785,9 +806,8 @@ def _lowered(body: RigidBody, turn: jax.Array) -> jax.Array:
     """
     d = body.dimension
     q = jnp.concatenate([jnp.zeros(d, turn.dtype), turn])
-    return q.at[:d].set(
-        -jnp.min(body.gap_function(q)) * body.planes[0, :d].astype(q.dtype)
-    )
+    normal = body.planes[0, :d].astype(q.dtype)
+    return q.at[:d].set(-jnp.min(body.gap_function(q)) * normal)
 
 
 def unit_quaternion(quaternion: Any) -> jax.Array:

@@ -48,9 +48,8 @@ class _PlanarBody(RigidBody):
         """Set the fields of a body with points (P, 2) [m] over the ground; see
         `RigidBody._set`.
         """
-        self._set(
-            points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0)
-        )
+        moments = positive("inertia", inertia)[None]
+        self._set(points, mass, moments, shape, rim, (0.0, 1.0))
 
 
 class Block(_PlanarBody):
@@ -102,12 +101,13 @@ class Block(_PlanarBody):
         check_choice("corners", corners, ("all", "base"))
         w = 0.5 * width
         h = 0.5 * height
-        points = jnp.stack(
-            [jnp.stack([-w, w, w, -w]), jnp.stack([-h, -h, h, h])], axis=1
-        )
+        x = jnp.stack([-w, w, w, -w])
+        y = jnp.stack([-h, -h, h, h])
+        points = jnp.stack([x, y], axis=1)
         # contact 1 is the right lower corner
         order = (1, 0, 3, 2) if corners == "all" else (1, 0)
-        self._make(points, mass, inertia, Shape(order, 4, faces=True, centred=False))
+        shape = Shape(order, 4, faces=True, centred=False)
+        self._make(points, mass, inertia, shape)
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
@@ -177,9 +177,8 @@ class Polygon(_PlanarBody):
                 f"Argument `centre` must lie inside the polygon, but has value "
                 f"{middle.tolist()}."
             )
-        self._make(
-            points, mass, inertia, Shape(order, len(order), faces=True, centred=False)
-        )
+        shape = Shape(order, len(order), faces=True, centred=False)
+        self._make(points, mass, inertia, shape)
 
 
 class Disc(_PlanarBody):
@@ -208,9 +207,8 @@ class Disc(_PlanarBody):
         self, radius: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None
     ):
         radius = positive("radius", radius)
-        inertia = _given_inertia(
-            inertia, 0.5 * positive("mass", mass) * radius**2, centre
-        )
+        homogeneous = 0.5 * positive("mass", mass) * radius**2
+        inertia = _given_inertia(inertia, homogeneous, centre)
         shape, middle = _round_shape(radius, centre, 2, True)
         self._make(middle[None], mass, inertia, shape, radius)
 
@@ -249,9 +247,8 @@ class Dimer(_PlanarBody):
     ):
         radius = positive("radius", radius, low_allowed=True)
         ends, mass, inertia = _dimer(radius, length, sphere_mass, rod_mass)
-        self._make(
-            ends, mass, inertia, Shape((0, 1), 2, faces=False, centred=False), radius
-        )
+        shape = Shape((0, 1), 2, faces=False, centred=False)
+        self._make(ends, mass, inertia, shape, radius)
 
 
 # --------------------------------------------------------------------------------- in
@@ -352,9 +349,8 @@ class Box(_SpatialBody):
         """
         sizes = positives("sizes", as_float_array("sizes", sizes), 3)
         rounding = positive("rounding", rounding, low_allowed=True)
-        middle = -as_numbers(
-            "centre", np.zeros(3) if centre is None else centre, (3,), "a vector"
-        )
+        from_middle = np.zeros(3) if centre is None else centre
+        middle = -as_numbers("centre", from_middle, (3,), "a vector")
         if not is_traced((sizes, rounding, middle)):
             half = 0.5 * np.asarray(sizes)
             check_values("rounding", rounding, high=float(half.min()))
@@ -363,10 +359,8 @@ class Box(_SpatialBody):
                     "Argument `centre` must lie inside the box, but has value "
                     f"{(-np.asarray(middle)).tolist()}."
                 )
-        points = (
-            middle[None]
-            + jnp.asarray(_SIGNS, sizes.dtype) * (0.5 * sizes - rounding)[None]
-        )
+        from_corners = (0.5 * sizes - rounding)[None]
+        points = middle[None] + jnp.asarray(_SIGNS, sizes.dtype) * from_corners
         homogeneous = (jnp.sum(sizes**2) - sizes**2) / 12
         shape = Shape(tuple(range(8)), 8, faces=True, centred=False)
         self._make(points, mass, inertia, homogeneous, centre, normal, shape, rounding)
@@ -374,7 +368,8 @@ class Box(_SpatialBody):
     @property
     def sizes(self) -> jax.Array:
         """(a, b, c) [m]."""
-        return self.points[0, -1] - self.points[0, 0] + 2 * self.rims[0]
+        diagonal = self.points[0, -1] - self.points[0, 0]
+        return diagonal + 2 * self.rims[0]
 
 
 class Sphere(_SpatialBody):
@@ -464,7 +459,8 @@ class SpatialDimer(_SpatialBody):
         inertia = jnp.stack([along, across, across])
         shape = Shape((0, 1), 2, faces=False, centred=False)
         points = jnp.pad(ends, ((0, 0), (0, 1)))
-        self._make(points, mass, inertia, jnp.ones(3), None, normal, shape, radius)
+        axes_of_moments = jnp.ones(3)
+        self._make(points, mass, inertia, axes_of_moments, None, normal, shape, radius)
 
 
 class Coin(_SpatialBody):
@@ -524,10 +520,10 @@ class Coin(_SpatialBody):
             raise ValueError(
                 f"Argument `corners` must be 0 or at least 3, but has value {corners}."
             )
-        angle = 2 * np.pi / max(corners, 1) * np.arange(corners)
-        points = self._rims(
-            jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1))
-        )
+        between = 2 * np.pi / max(corners, 1)
+        angle = between * np.arange(corners)
+        outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        points = self._rims(jnp.asarray(outward))
         across = (3 * radius**2 + thickness**2) / 12
         homogeneous = jnp.stack([across, across, 0.5 * radius**2])
         # on edge it does not look the same from all sides: not `centred`
@@ -542,9 +538,11 @@ class Coin(_SpatialBody):
         """
         radius, thickness = self.disc
         outward = outward.astype(self.disc.dtype)
-        levels = 0.5 * thickness * jnp.array([-1.0, 1.0], outward.dtype)
+        sides = jnp.array([-1.0, 1.0], outward.dtype)
+        levels = 0.5 * thickness * sides
         each = jnp.repeat(levels, len(outward))[:, None]
-        return jnp.concatenate([jnp.tile(radius * outward, (2, 1)), each], axis=1)
+        rims = jnp.tile(radius * outward, (2, 1))
+        return jnp.concatenate([rims, each], axis=1)
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
@@ -574,13 +572,15 @@ class Coin(_SpatialBody):
         turn, up = self._toward(q)
         # direction from the axis to them, -(u_1, u_2) / s
         _, towards = lengths(_across_axis(up)[None])
-        points = place_of(q)[None] + self._rims(-towards) @ turn.T
+        rims = self._rims(-towards)
+        points = place_of(q)[None] + rims @ turn.T
         n = jnp.broadcast_to(self.plane_normals, points.shape)
         return ContactPoints(jnp.sum(n * points, axis=1), points, n)
 
     def pairs_in_contact(self) -> np.ndarray:
         """Body 0 and the plane, -1, of each contact (m, 2)."""
-        return np.array([[0, -1]] * (self.points.shape[1] or 2), np.int32)
+        contacts = self.points.shape[1] or 2
+        return np.array([[0, -1]] * contacts, np.int32)
 
     def valid(self, q: jax.Array) -> jax.Array:
         """Margin () of the quaternion's length; of a round coin also `s - FLAT`, see
@@ -600,14 +600,18 @@ class Coin(_SpatialBody):
         corners = self.points.shape[1] // 2
         around = np.linspace(0, 2 * np.pi, corners + 1)
         if corners:
-            ring = np.stack([np.cos(around), np.sin(around)], axis=1)
+            components = [np.cos(around), np.sin(around)]
+            ring = np.stack(components, axis=1)
         else:
             ring = CIRCLE
-        rims = np.asarray(self._rims(jnp.asarray(ring))).reshape(2, -1, 3)
-        across = np.asarray(self._rims(jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])))
+        points = np.asarray(self._rims(jnp.asarray(ring)))
+        rims = points.reshape(2, -1, 3)
+        ends = jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])
+        across = np.asarray(self._rims(ends))
         turn = np.asarray(rotation(quaternion_of(jnp.asarray(q))))
         _, diameter = across.reshape(2, -1, 3)  # of the lower and of the upper rim
-        curves = [place_of(q) + curve @ turn.T for curve in (*rims, diameter)]
+        in_body = (*rims, diameter)
+        curves = [place_of(q) + curve @ turn.T for curve in in_body]
         return [[line for curve in curves for line in self.with_shadow(curve)]]
 
 
@@ -645,7 +649,8 @@ def _round_shape(
                 f"Argument `centre` must be at most {float(radius):g} m from the "
                 f"middle, but has value {(-middle).tolist()}."
             )
-    return Shape((0,), 1, faces=False, centred=isotropic and centre is None), middle
+    centred = isotropic and centre is None
+    return Shape((0,), 1, faces=False, centred=centred), middle
 
 
 def _dimer(
@@ -665,8 +670,10 @@ def _dimer(
         )
     sphere = positive("sphere_mass", sphere_mass)
     rod = positive("rod_mass", rod_mass, low_allowed=True)
-    ends = arm * jnp.array([[1.0, 0.0], [-1.0, 0.0]], arm.dtype)
-    inertia = 2 * sphere * (0.4 * radius**2 + arm**2) + rod * length**2 / 12
+    directions = jnp.array([[1.0, 0.0], [-1.0, 0.0]], arm.dtype)
+    ends = arm * directions
+    of_spheres = 2 * sphere * (0.4 * radius**2 + arm**2)
+    inertia = of_spheres + rod * length**2 / 12
     return ends, 2 * sphere + rod, inertia
 
 
@@ -686,9 +693,8 @@ def _moments_in_space(value: Any) -> jax.Array:
     try:
         check_mass(inertia)
     except ValueError as error:
-        raise ValueError(
-            str(error).replace("`mass`", "`inertia`").replace("M ", "I ")
-        ) from None
+        words = str(error).replace("`mass`", "`inertia`")
+        raise ValueError(words.replace("M ", "I ")) from None
     moments = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
     *others, largest = moments
     if largest > (1 + _SLACK) * sum(others):
@@ -713,16 +719,19 @@ def _around(corners: jax.Array) -> tuple[int, ...]:
     side = np.roll(c, -1, axis=0) - c
     after = np.roll(side, -1, axis=0)
     # [rad] between sides
-    turn = np.arctan2(_cross(side, after), np.sum(side * after, axis=1))
+    cosine = np.sum(side * after, axis=1)
+    turn = np.arctan2(_cross(side, after), cosine)
     around = np.sign(turn.sum())  # 1: counter-clockwise
-    bad = np.flatnonzero(~((turn * around > 0) & (turn * around < np.pi)))
+    good = (turn * around > 0) & (turn * around < np.pi)
+    bad = np.flatnonzero(~good)
     if bad.size:
         worst = int(bad[0] + 1) % k
         raise ValueError(
             f"Argument `corners` {_CONVEX}, but it does not turn the same way at "
             f"corner {worst}, {c[worst].tolist()}."
         )
-    if abs(abs(turn.sum()) - 2 * np.pi) > _FULL_TURN:
+    full_turn = abs(turn.sum())
+    if abs(full_turn - 2 * np.pi) > _FULL_TURN:
         raise ValueError(
             f"Argument `corners` {_CONVEX}, but they go around it more than once."
         )
@@ -751,8 +760,10 @@ def inner_radii(corners: jax.Array) -> jax.Array:
     """
     side = jnp.roll(corners, -1, axis=1) - corners
     length = jnp.sqrt(jnp.sum(side**2, axis=2))
-    distance = _cross(corners, side) / jnp.where(length > 0, length, 1.0)
-    return jnp.min(jnp.where(length > 0, distance, jnp.inf), axis=1)
+    divisor = jnp.where(length > 0, length, 1.0)
+    distance = _cross(corners, side) / divisor
+    of_sides = jnp.where(length > 0, distance, jnp.inf)
+    return jnp.min(of_sides, axis=1)
 
 
 @jax.jit
@@ -771,7 +782,9 @@ def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
     end = jnp.roll(start, -1, axis=0)
     twice_area = _cross(start, end)  # of the triangles at corner 0
     total = jnp.sum(twice_area)
-    middle = jnp.sum((start + end) * twice_area[:, None], axis=0) / (3 * total)
-    squares = jnp.sum(start**2 + start * end + end**2, axis=1)
+    weighted = (start + end) * twice_area[:, None]
+    middle = jnp.sum(weighted, axis=0) / (3 * total)
+    terms = start**2 + start * end + end**2
+    squares = jnp.sum(terms, axis=1)
     about_corner = jnp.sum(twice_area * squares) / (6 * total)
     return ring[0] + middle, about_corner - jnp.sum(middle**2)

@@ -42,7 +42,8 @@ def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
     """
     check_keys(where, table, tuple(table), required=("kind",))
     names = {name.lower(): name for name in sorted(BODIES)}
-    name = names.get(str(table["kind"]).lower(), table["kind"])
+    kind = str(table["kind"]).lower()
+    name = names.get(kind, table["kind"])
     check_word(f"`kind` in {where}", name, names.values())
     parameters = inspect.signature(BODIES[name]).parameters
     # key of the table, with its unit -> argument of the class

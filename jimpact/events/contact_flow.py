@@ -108,7 +108,8 @@ def power(x: Float[Array, "m *B"], exponent: Exponent) -> Float[Array, "m *B"]:
             factors = [*whole, jnp.sqrt(safe)]
         return functools.reduce(jnp.multiply, factors)
     eta = per_row(exponent, x)
-    return jnp.where(positive, jnp.exp(eta * jnp.log(safe)), 0.0)
+    raised = jnp.exp(eta * jnp.log(safe))
+    return jnp.where(positive, raised, 0.0)
 
 
 def per_row(values: Exponent, like: Float[Array, "m *B"]) -> Float[Array, "#m *#B"]:
@@ -118,7 +119,8 @@ def per_row(values: Exponent, like: Float[Array, "m *B"]) -> Float[Array, "#m *#
     values = jnp.asarray(values, like.dtype)
     if values.ndim == like.ndim:
         return values
-    return values.reshape(-1, *[1] * (like.ndim - 1))
+    axes_of_batch = [1] * (like.ndim - 1)
+    return values.reshape(-1, *axes_of_batch)
 
 
 def smallest_of(s: Float[Array, "m B"]) -> Float[Array, "1 B"]:
@@ -176,7 +178,8 @@ class Viscous(NamedTuple):
     ) -> Float[Array, "m B"]:
         """Dimensionless force `max(F(X x, -V gamma), 0) / F_0`: it never pulls."""
         x = jnp.where(x >= 0, x, 0.0) * self.indentation
-        return jnp.maximum(self._value("force", x, gamma) / self.force, 0.0)
+        force = self._value("force", x, gamma)
+        return jnp.maximum(force / self.force, 0.0)
 
     def onset(
         self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]
@@ -200,9 +203,8 @@ class Viscous(NamedTuple):
             """The method's values in the contacts of one impact."""
             return getattr(model, name)(x, rate)
 
-        return jax.vmap(of_one, in_axes=-1, out_axes=-1)(
-            self.model, x, -gamma * self.speed
-        )
+        of_batch = jax.vmap(of_one, in_axes=-1, out_axes=-1)
+        return of_batch(self.model, x, -gamma * self.speed)
 
 
 # fields of flows and couplings that are no arrays: they belong to the program
@@ -253,7 +255,8 @@ def written_out(coupling: Any, n: int) -> Float[Array, "n n B"]:
     """
     entries = jax.tree.leaves(coupling)[0]
     one = jnp.eye(n, dtype=entries.dtype)[..., None]
-    columns = jnp.broadcast_to(one, (n, n, entries.shape[-1]))
+    batch = entries.shape[-1]
+    columns = jnp.broadcast_to(one, (n, n, batch))
     return jax.vmap(coupling.times, out_axes=1)(columns)
 
 
@@ -298,11 +301,13 @@ class Dense(NamedTuple):
 
     def magnitude(self) -> "Dense":
         """|G|, entry by entry, with a unit diagonal."""
-        return Dense(jnp.abs(self._off_diagonal()) + unit(self.matrix))
+        others = jnp.abs(self._off_diagonal())
+        return Dense(others + unit(self.matrix))
 
     def pull(self) -> "Dense":
         """min(G, 0) with a unit diagonal."""
-        return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
+        others = jnp.minimum(self._off_diagonal(), 0.0)
+        return Dense(others + unit(self.matrix))
 
 
 @as_pytree
@@ -507,7 +512,8 @@ class ContactFlow(Flow):
         phase = jnp.where(spent, Phase.OPEN, phase)
         x = jnp.where(spent, 0.0, x)
         g = gamma / self.equations.scale(phase == Phase.EXPANSION, self.restitution)
-        modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
+        no_closings = jnp.zeros_like(phase)
+        modes = jnp.concatenate([phase, no_closings]).astype(jnp.int32)
         p = jnp.zeros_like(g)
         time = jnp.zeros_like(self.tolerance)
         watched = time
@@ -549,7 +555,8 @@ class ContactFlow(Flow):
             moves = moves & (phase != Phase.YIELD)
             loaded = loaded | (phase == Phase.YIELD)
         closing = jnp.where(moves, -ratio * self.omega, 0.0)
-        stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
+        eta = per_row(self.exponent, self.omega)
+        stiffness = (eta + 1) / 2 * self.omega
         stiffness = jnp.where(loaded, stiffness, 0.0)
         return Frozen(unit, ratio, closing, stiffness, scale=s)
 
@@ -562,7 +569,8 @@ class ContactFlow(Flow):
         """
         if self.viscous is None:
             return self.equations.force(x, const.stiffness, self.exponent)
-        return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
+        push = self.viscous.push(x, g)
+        return jnp.where(const.stiffness > 0, push, 0.0)
 
     def field(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
@@ -578,7 +586,8 @@ class ContactFlow(Flow):
         dp = const.unit * f
         if not self.watches:
             return jnp.concatenate([dx, dg, dp, const.unit])
-        slope = f * jnp.log(jnp.where(x > 0, x, 1.0))
+        positive = jnp.where(x > 0, x, 1.0)
+        slope = f * jnp.log(positive)
         watched = jax.lax.stop_gradient(const.unit * total(slope))
         return jnp.concatenate([dx, dg, dp, watched, const.unit])
 
@@ -636,7 +645,8 @@ class ContactFlow(Flow):
             onset = self.viscous.onset(x, g)  # type: ignore[union-attr]
             compressed = phase == Phase.COMPRESSION
             slack = phase == Phase.SLACK
-            by_x = jnp.where(compressed, onset, jnp.where(slack, -onset, by_x))
+            of_slack = jnp.where(slack, -onset, by_x)
+            by_x = jnp.where(compressed, onset, of_slack)
             by_g = jnp.where(compressed | slack, x, by_g)
         return jnp.concatenate([by_x, by_g])
 
@@ -675,7 +685,8 @@ class ContactFlow(Flow):
         phase, closings, slip = self.modes(modes)
         by_x, by_g, _, _ = self.kinds(which)
         if self.slopes:
-            y = jnp.where(self.at_corner(phase, y, by_g), without_slope(y), y)
+            corner = self.at_corner(phase, y, by_g)
+            y = jnp.where(corner, without_slope(y), y)
         if self.slackens:
             closed = by_x & (phase == Phase.OPEN)
             after, rows = self._slackening(phase, self.rows(y), by_x, by_g)
@@ -683,7 +694,8 @@ class ContactFlow(Flow):
             closed = (by_x | by_g) & (phase == Phase.OPEN)
             after, rows = self._turning(phase, self.rows(y), by_x, by_g)
         closings = closings + closed.astype(closings.dtype)
-        packed = Modes(after, closings, slip).packed().astype(modes.dtype)
+        now = Modes(after, closings, slip)
+        packed = now.packed().astype(modes.dtype)
         return packed, self.with_rows(y, rows)
 
     def _turning(
@@ -719,8 +731,10 @@ class ContactFlow(Flow):
             yields = by_x & (phase == Phase.COMPRESSION) & ~turned
             x = jnp.where(yields, self.limit, x)
             after = jnp.where(yields, Phase.YIELD, after)
-            after = jnp.where(by_g & (phase == Phase.YIELD), Phase.EXPANSION, after)
-        after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)
+            unloads = by_g & (phase == Phase.YIELD)
+            after = jnp.where(unloads, Phase.EXPANSION, after)
+        returns = by_g & (phase == Phase.EXPANSION)
+        after = jnp.where(returns, Phase.COMPRESSION, after)
         after = jnp.where(closed, Phase.COMPRESSION, after)
         after = jnp.where(opened, Phase.OPEN, after)
         g = jnp.where(opened, self.restitution * g, g)
@@ -766,7 +780,8 @@ class ContactFlow(Flow):
         opened = by_g & ~is_open
         closed = by_x & is_open
         free = (phase == Phase.SLACK) | is_open
-        after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
+        ends = by_x & (phase == Phase.COMPRESSION)
+        after = jnp.where(ends, Phase.SLACK, phase)
         after = jnp.where(by_x & free, Phase.COMPRESSION, after)
         after = jnp.where(opened, Phase.OPEN, after)
         x = jnp.where(opened | closed, 0.0, x)
@@ -781,7 +796,8 @@ class ContactFlow(Flow):
         """
         if not self.gapped:
             return jnp.zeros((1, *before.shape[1:]), bool)
-        return any_of(self.modes(after).closings > self.modes(before).closings)
+        closed_before = self.modes(before).closings
+        return any_of(self.modes(after).closings > closed_before)
 
     def coasts(self, modes: Int[Array, "modes B"]) -> Bool[Array, "1 B"] | None:
         """Mask: no contact is loaded; None without gaps."""
@@ -898,11 +914,14 @@ class ContactFlow(Flow):
         x, g, _ = self.rows(y)
         gamma = self.scales(modes) * g
         energy = self.energy(x, g)
-        works = ((x > 0) | (gamma < 0)) & (energy > tolerance**2)
+        loaded = (x > 0) | (gamma < 0)
+        works = loaded & (energy > tolerance**2)
         if self.viscous is not None:
             works = self.loaded(modes) & (x > 0) | (gamma < 0)
-            works = works & ((x > tolerance) | (jnp.abs(g) > tolerance))
-        rebound = self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))
+            moves = (x > tolerance) | (jnp.abs(g) > tolerance)
+            works = works & moves
+        stored = jnp.where(works, energy, 1.0)
+        rebound = self.restitution * jnp.sqrt(stored)
         return works, gamma, jnp.where(works, rebound, gamma)
 
     def over(
@@ -947,6 +966,7 @@ class ContactFlow(Flow):
         if not self.closed_form:
             rebound = gamma
         phase, closings, slip = self.modes(modes)
-        modes = Modes(jnp.full_like(phase, Phase.OPEN), closings, slip).packed()
+        all_open = jnp.full_like(phase, Phase.OPEN)
+        modes = Modes(all_open, closings, slip).packed()
         rows = Contacts(jnp.zeros_like(x), rebound, p + rebound - gamma)
         return modes, self.with_rows(y, rows)

@@ -189,7 +189,8 @@ class FrictionFlow(ContactFlow):
         time.
         """
         x, g, p = self.rows(y)
-        return FrictionRows(x, g, p, u, jnp.zeros_like(u), time=y[-1:]).packed()
+        no_impulse = jnp.zeros_like(u)
+        return FrictionRows(x, g, p, u, no_impulse, time=y[-1:]).packed()
 
     def friction_rows(self, y: Float[Array, "n B"]) -> FrictionRows:
         """All rows of a state."""
@@ -238,7 +239,8 @@ class FrictionFlow(ContactFlow):
         slip = self.modes(modes).slip
         stick = (slip == 0) & self.loaded(modes)
         drag = -slip.astype(self.friction.dtype) * self.friction
-        k = jnp.where(stick[:, None] & stick[None], self.tangent, 0.0)
+        both = stick[:, None] & stick[None]
+        k = jnp.where(both, self.tangent, 0.0)
         return FrictionConstants(
             frozen=self.normal_constants(modes),
             stick=stick,
@@ -285,7 +287,8 @@ class FrictionFlow(ContactFlow):
         together = largest + size
         some = const.stick & (together > 0)
         room = quotient(largest - size, together, where=some, otherwise=1.0)
-        rate = jnp.where(const.stick, 0.0, pull + times(self.tangent, hold))
+        pulled = pull + times(self.tangent, hold)
+        rate = jnp.where(const.stick, 0.0, pulled)
         return FrictionForces(f, const.drag * f + hold, rate, room)
 
     def field(
@@ -323,7 +326,8 @@ class FrictionFlow(ContactFlow):
         speed = sign.astype(y.dtype) * self.slip(y)
         speed = jnp.where(slides, speed, 1.0)
         normal = self.normal_margins(const.frozen, modes, y)
-        return jnp.concatenate([normal, speed, self.forces(const, y).room])
+        room = self.forces(const, y).room
+        return jnp.concatenate([normal, speed, room])
 
     def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "k B"]:
         """Mask of the openings, as in the normal flow; margins of friction have no
@@ -386,9 +390,11 @@ class FrictionFlow(ContactFlow):
         tangent_normal = jnp.swapaxes(constant.normal_tangent, 0, 1)
         b = times(tangent_normal, f) + times(constant.tangent, sliding)
         stick, towards = distribute(constant.tangent, b, cone, to_check)
-        towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
+        signs = jnp.sign(towards).astype(slip.dtype)
+        towards = jnp.where(stick, 0, signs)
         slip = jnp.where(to_check, towards, slip)
-        y = self._at_rest(modes, y, to_check, jnp.where(stick, cone, 0.0))
+        held_cone = jnp.where(stick, cone, 0.0)
+        y = self._at_rest(modes, y, to_check, held_cone)
         return self.with_slip_modes(modes, slip), y
 
     def _at_rest(
@@ -415,7 +421,8 @@ class FrictionFlow(ContactFlow):
         q = w * regularized_once(self.tangent * w[None], soft, right)
         dg = self.as_rows(modes, times(self.normal_tangent, q))
         u = u + times(self.tangent, q)
-        u = jnp.where(rests, u - jax.lax.stop_gradient(u), u)
+        without_value = u - jax.lax.stop_gradient(u)
+        u = jnp.where(rests, without_value, u)
         rows = rows._replace(g=rows.g + dg, u=u, side=rows.side + q)
         return rows.packed()
 
@@ -450,7 +457,8 @@ class FrictionFlow(ContactFlow):
 
     def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
         """Change `G p + K_nt p_t` of the gap velocities by the impulses of a state."""
-        return super().change(y) + times(self.normal_tangent, self.side_impulse(y))
+        side = self.side_impulse(y)
+        return super().change(y) + times(self.normal_tangent, side)
 
     # ---- the end
 
@@ -503,7 +511,8 @@ class FrictionFlow(ContactFlow):
         passes: Float[Array, "1 B"],
     ) -> Bool[Array, "1 B"]:
         """Mask: no contact is loaded or approaches."""
-        works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
+        left = LEFT * self.patience(passes)
+        works, *_ = self.at_work(modes, y, left)
         return ~any_of(works)
 
     def finish(
@@ -515,7 +524,8 @@ class FrictionFlow(ContactFlow):
         if self.at_once:
             return modes, self._after_one(modes, y)
         x, g, p = self.rows(y)
-        return modes, self.with_rows(y, Contacts(jnp.zeros_like(x), g, p))
+        at_rest = Contacts(jnp.zeros_like(x), g, p)
+        return modes, self.with_rows(y, at_rest)
 
     def settled(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], cycle: Cycle
@@ -558,7 +568,8 @@ class FrictionFlow(ContactFlow):
         impulses = impulses + nearest
         dp = impulses[:m]
         dq = impulses[m:]
-        dg = self.as_rows(modes, times(g_nn, dp) + times(k_nt, dq))
+        gamma_change = times(g_nn, dp) + times(k_nt, dq)
+        dg = self.as_rows(modes, gamma_change)
         rows = FrictionRows(
             x=jnp.zeros_like(rows.x),
             g=rows.g + dg,
@@ -590,12 +601,14 @@ class FrictionFlow(ContactFlow):
         mu = self.friction
         drag = -sign.astype(u.dtype) * mu
         hold = quotient(-k_nt, k_tt, where=k_tt > 0)
-        hold = jnp.sign(hold) * jnp.minimum(jnp.abs(hold), mu)
+        size = jnp.minimum(jnp.abs(hold), mu)
+        hold = jnp.sign(hold) * size
         du = k_nt + k_tt * drag  # over dp, while it slides
         stops = (sign != 0) & (u * du < 0)
         length = quotient(-u, du, where=stops, otherwise=jnp.inf)
         length = jnp.where(sign == 0, 0.0, length)
-        energy = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
+        stored = power(x, plus_one(self.exponent))
+        energy = jnp.where(x > 0, stored, 0.0)
         start = SingleContact(
             gap_velocity=jnp.where(works, gamma, -1.0),
             energy=energy,
@@ -662,8 +675,10 @@ def _next_piece(
     slides = s.left > 0
     slope = jnp.where(slides, *slopes)
     until_stop = jnp.where(slides, s.left, jnp.inf)
-    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))  # is compressed
-    expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
+    begins = (gamma == 0) & (slope < 0)
+    closes = (gamma < 0) | begins  # is compressed
+    parts = (gamma > 0) | (slope > 0)
+    expands = ~closes & (energy > 0) & parts
     turns = closes & (slope > 0)
     from_rest = expands & (gamma == 0)
     moving = expands & ~from_rest
@@ -673,9 +688,12 @@ def _next_piece(
     square = jnp.where(moving, gamma**2 + e**2 * slope * energy, 1.0)
     falls = square <= 0  # gamma turns before
     end = jnp.sqrt(jnp.where(falls, 1.0, square))
-    end = jnp.where(from_rest, e * jnp.sqrt(up * stored), end)
-    unloading = e**2 * stored / jnp.where(moving & ~falls, gamma + end, 1.0)
-    unloading = jnp.where(from_rest, e * jnp.sqrt(stored / up), unloading)
+    of_rest = e * jnp.sqrt(up * stored)
+    end = jnp.where(from_rest, of_rest, end)
+    speeds = jnp.where(moving & ~falls, gamma + end, 1.0)
+    unloading = e**2 * stored / speeds
+    of_rest_too = e * jnp.sqrt(stored / up)
+    unloading = jnp.where(from_rest, of_rest_too, unloading)
     # the piece
     falling = -gamma / jnp.where(falls, slope, 1.0)
     length = jnp.where(falls, falling, unloading)
@@ -685,7 +703,8 @@ def _next_piece(
     dp = jnp.where(reached, length, until_stop)
     dp = jnp.where(closes | expands, dp, 0.0)
     unloaded = expands & reached & ~falls
-    after = jnp.where(reached & (turns | falls), 0.0, gamma + slope * dp)
+    stands = reached & (turns | falls)
+    after = jnp.where(stands, 0.0, gamma + slope * dp)
     after = jnp.where(unloaded, end, after)
     share = jnp.where(expands & ~unloaded, e**2, 1.0)
     left_energy = energy - (gamma + after) * dp / share

@@ -158,15 +158,18 @@ def dimensionless(
     root = jnp.sqrt(diagonal(delassus))
     qn = gamma / root
     approach = jnp.where(gamma < 0, qn, 0.0)
-    q = jax.lax.stop_gradient(jnp.sqrt(jnp.max(approach**2 + 2 * stored)))
+    energies = approach**2 + 2 * stored
+    q = jax.lax.stop_gradient(jnp.sqrt(jnp.max(energies)))
     x_ref = equations.depth(q, stiffness, eta)
     t_ref = x_ref / (q * root)
     time = jax.lax.stop_gradient(jnp.min(t_ref))
     # the tolerance applies to velocities: where W_jj is large, impulses must be finer
-    fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
+    speed_of_stored = jnp.sqrt(2 * stored) * root
+    fastest = jnp.max(jnp.maximum(-gamma, speed_of_stored))
     weight = jnp.maximum(1.0, q * root / fastest)
     omega = time / t_ref
-    closeness = jax.lax.stop_gradient(jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega)))
+    slowest = WIDE_SPREAD * jnp.min(omega)
+    closeness = jax.lax.stop_gradient(jnp.minimum(1.0, slowest))
     g = scaled(delassus, 1 / root)
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
@@ -175,7 +178,8 @@ def dimensionless(
     else:
         count = jnp.sum(closed, dtype=dtype)
     count = jnp.maximum(count, 1)
-    step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
+    share = jnp.minimum(1.0, 2 / count)
+    step = jax.lax.stop_gradient(rtol * share / jnp.max(weight))
     array = None
     if isinstance(exponent, jax.Array):
         array = exponent * ones
@@ -320,7 +324,8 @@ def undecided(problem: Problem) -> Bool[Array, "1 B"]:
     if problem.viscous is None or problem.gap is None:
         return jnp.zeros_like(problem.tolerance, bool)
     none = jnp.zeros_like(gamma)
-    touches = (problem.gap <= 0) & (jnp.abs(gamma) <= SNAP * problem.tolerance)
+    at_rest = jnp.abs(gamma) <= SNAP * problem.tolerance
+    touches = (problem.gap <= 0) & at_rest
     return any_of(touches & (problem.viscous.push(none, none) > 0))
 
 
@@ -522,7 +527,8 @@ class ImplicitProgram(ImpulseProgram):
     ) -> Int[Array, "1 B"]:
         """Status of a run: max_steps where it has not ended."""
         busy = value_of(flow).busy(value_of(run.state))
-        return jnp.where(busy, CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
+        code = jnp.where(busy, CODE["max_steps"], CODE["ok"])
+        return code.astype(jnp.int32)
 
 
 def method_for(
@@ -604,8 +610,10 @@ def solve(
     leaves, _ = dynamics.columns()
     if condition_check is not None:
         again, _ = dynamics._replace(problem=perturbed(problem)).columns()
-        leaves = tuple(jnp.concatenate([x, y], axis=-1) for x, y in zip(leaves, again))
-    p, side, _, code, _ = evaluate(dynamics.program(), leaves, dynamics.adjoint)
+        pairs = zip(leaves, again)
+        leaves = tuple(jnp.concatenate([x, y], axis=-1) for x, y in pairs)
+    program = dynamics.program()
+    p, side, _, code, _ = evaluate(program, leaves, dynamics.adjoint)
     p = p * units.momentum[:, None]
     code = code[0]
     p_t = None
@@ -614,7 +622,8 @@ def solve(
         p_t = side * jnp.repeat(units.momentum, rows)[:, None]
     if condition_check is not None:
         ill = is_ill_conditioned(condition_check, p, p_t, code, units.error)
-        code = jnp.maximum(code, jnp.where(ill, CODE["ill_conditioned"], CODE["ok"]))
+        warning = jnp.where(ill, CODE["ill_conditioned"], CODE["ok"])
+        code = jnp.maximum(code, warning)
     if p_t is not None:
         p_t = p_t[:, 0]
     return p[:, 0], p_t, code[0]

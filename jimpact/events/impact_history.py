@@ -137,7 +137,8 @@ class HistoryProgram:
             jnp.where(over, 0.0, end.seen.clock),
         )
         time, energy, contacts = jax.lax.map(sampled, samples)
-        force = jnp.where(last > end.seen.force, last, end.seen.force)
+        is_last = last > end.seen.force
+        force = jnp.where(is_last, last, end.seen.force)
         return time, energy, *contacts, force, end.status.astype(y.dtype)
 
 
@@ -158,7 +159,8 @@ class ImplicitHistoryProgram(HistoryProgram):
         the largest forces.
         """
         outcome = self.outcome
-        flow, start = outcome.steps(jax.tree.unflatten(outcome.tree, leaves))
+        problem = jax.tree.unflatten(outcome.tree, leaves)
+        flow, start = outcome.steps(problem)
         max_passes = outcome.max_passes
         checkpoints = outcome.checkpoints
         constant = jax.lax.stop_gradient((flow, start))
@@ -194,7 +196,8 @@ class ImplicitHistoryProgram(HistoryProgram):
 
         samples = self.fractions(t.dtype), run.seen.states
         time, energy, contacts = jax.lax.map(sampled, samples)
-        force = jnp.maximum(run.seen.force, force_in(flow, run.state))
+        last = force_in(flow, run.state)
+        force = jnp.maximum(run.seen.force, last)
         code = outcome.code(flow, run).astype(t.dtype)
         return time, energy, *contacts, force, code
 

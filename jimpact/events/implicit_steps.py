@@ -185,7 +185,8 @@ class ImplicitSteps:
 
     def energy(self, x: Float[Array, "m B"]) -> Float[Array, "m B"]:
         """Twice the stored energy, `x^(eta + 1)`."""
-        return power(x, self.exponent) * jnp.where(x > 0, x, 0.0)
+        positive = jnp.where(x > 0, x, 0.0)
+        return power(x, self.exponent) * positive
 
     def busy(self, s: ImplicitState) -> Bool[Array, "1 B"]:
         """Mask of the impacts that go on: a contact is loaded, or approaches."""
@@ -204,10 +205,12 @@ class ImplicitSteps:
         rate = self.omega * jnp.where(closes, gamma, -1.0)
         waits = jnp.where(closes, x / rate, jnp.inf)
         wait = jnp.min(waits, axis=0, keepdims=True)
-        loaded = (x > 0) | ((x >= 0) & (gamma < 0))
+        begins = (x >= 0) & (gamma < 0)
+        loaded = (x > 0) | begins
         free = ~any_of(loaded)
         wait = jnp.where(free & (wait < jnp.inf), wait, 0.0)
-        x = jnp.where(wait > 0, x - wait * self.omega * gamma, x)
+        coasted = x - wait * self.omega * gamma
+        x = jnp.where(wait > 0, coasted, x)
         return s._replace(indentation=x, time=s.time + wait)
 
     # ---- one step
@@ -218,7 +221,8 @@ class ImplicitSteps:
         """Normal forces `(eta + 1) / 2 omega x^eta`, or those of a viscous model."""
         if self.viscous is None:
             return self.equations.force(x, self.force_scale, self.exponent)
-        return jnp.where(x > 0, self.viscous.push(x, gamma), 0.0)
+        push = self.viscous.push(x, gamma)
+        return jnp.where(x > 0, push, 0.0)
 
     def unloading(
         self, x: Float[Array, "m B"], h: Float[Array, "1 B"]
@@ -300,7 +304,8 @@ class ImplicitSteps:
             impulses = self.frictional_impulses
         else:
             impulses = self.normal_impulses
-        impulse, rate, load, error = impulses(s, h, Middle(half, load, unloading))
+        in_the_middle = Middle(half, load, unloading)
+        impulse, rate, load, error = impulses(s, h, in_the_middle)
         velocity = s.velocity + self.coupling.times(impulse)
         normal, _ = self.parts(impulse)
         after, _ = self.parts(velocity)
@@ -322,12 +327,14 @@ class ImplicitSteps:
         if self.gapped:
             opening = -h / 2 * self.omega * after
         end = jnp.where(opened, opening, end)
-        loss = self.lost(x, jnp.where(stiff, x, half), end, after)
+        begin = jnp.where(stiff, x, half)
+        loss = self.lost(x, begin, end, after)
         loss = loss + error + self.dropped(load, opened, gamma, after)
         loss = loss + self.slackened(x, end, gamma, after, h)
         # no tangents: where nothing is stored, the slope of a root would be infinite
         loss = jax.lax.stop_gradient(loss)
-        return ImplicitState(end, velocity, rate, s.impulse + impulse, s.time + h), loss
+        total = s.impulse + impulse
+        return ImplicitState(end, velocity, rate, total, s.time + h), loss
 
     def frictional_impulses(
         self, s: ImplicitState, h: Float[Array, "1 B"], middle: Middle
@@ -348,21 +355,25 @@ class ImplicitSteps:
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, u / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
-        first, first_error = solve(stage, self.guess(s.rate, load), inner)
+        first_guess = self.guess(s.rate, load)
+        first, first_error = solve(stage, first_guess, inner)
         f1, y1 = self.parts(first)
         if self.viscous is not None:
             load = load_after(first)
         side = (1 - PART) * y1
         none = jnp.zeros_like(gamma)
-        base = s.velocity + self.coupling.times(jnp.concatenate([none, side]))
+        impulses = jnp.concatenate([none, side])
+        base = s.velocity + self.coupling.times(impulses)
         # second stage, in units in which both rows have the weight PART
-        stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
+        friction = self.friction * PART
+        stage = self.problem(base / PART, load / PART, unloading, friction)
         guess = jnp.concatenate([f1 / PART, y1])
         second, second_error = solve(stage, guess, inner)
         f2, y2 = self.parts(second)
         normal = PART * f2
+        whole_side = side + PART * y2
         return StageImpulses(
-            impulse=jnp.concatenate([normal, side + PART * y2]),
+            impulse=jnp.concatenate([normal, whole_side]),
             rate=jnp.concatenate([normal, y2]) / h,
             load=load,
             error=(1 - PART) * first_error + PART * second_error,
@@ -377,8 +388,10 @@ class ImplicitSteps:
         tangents = len(rate) // self.contacts - 1  # of a contact
         normal, side = self.parts(rate)
         pressed = normal > 0
-        carried = jnp.repeat(jnp.where(pressed, normal, 1.0), tangents, axis=0)
-        loads = jnp.repeat(jnp.where(pressed, load, 0.0), tangents, axis=0)
+        of_pressed = jnp.where(pressed, normal, 1.0)
+        carried = jnp.repeat(of_pressed, tangents, axis=0)
+        load_of_pressed = jnp.where(pressed, load, 0.0)
+        loads = jnp.repeat(load_of_pressed, tangents, axis=0)
         return jnp.concatenate([load, side / carried * loads])
 
     def normal_impulses(
@@ -421,7 +434,8 @@ class ImplicitSteps:
         x and `half`), 0 of an open one that closes, without gaps, and 1 of others.
         """
         turns = gamma * after < 0
-        part = quotient(-gamma * after, jnp.abs(gamma) + jnp.abs(after), where=turns)
+        both = jnp.abs(gamma) + jnp.abs(after)
+        part = quotient(-gamma * after, both, where=turns)
         loaded = (x > 0) & (half > 0)
         approaching = 1.0  # c
         separating = jnp.ones_like(x)  # c'
@@ -438,7 +452,8 @@ class ImplicitSteps:
         """
         x_to_eta = impulse / (h * self.force_scale)
         positive = x_to_eta > 0
-        log_x = jnp.log(jnp.where(positive, x_to_eta, 1.0)) / self.eta
+        power_of_x = jnp.where(positive, x_to_eta, 1.0)
+        log_x = jnp.log(power_of_x) / self.eta
         x = jnp.exp(log_x)
         return jnp.where(positive, x, 0.0)
 
@@ -462,7 +477,8 @@ class ImplicitSteps:
         gone = (x_before > 0) & (x <= 0) & (gamma > 0)
         root = jnp.sqrt(left)
         faster = quotient(self.least * left, gamma, where=gamma > 0)
-        return largest_of(jnp.where(gone, jnp.minimum(root, faster), 0.0))
+        speed = jnp.minimum(root, faster)
+        return largest_of(jnp.where(gone, speed, 0.0))
 
     def dropped(
         self,
@@ -557,7 +573,8 @@ class ImplicitSteps:
         allowed = ALLOWED * self.tolerance + precision(h.dtype).accumulated * size
         better = jax.tree.map(lambda a, b: a + (a - b) / 3, end, whole)
         loaded = (end.indentation > 0) & (whole.indentation > 0)
-        x = jnp.where(loaded, jnp.maximum(better.indentation, 0.0), end.indentation)
+        at_least = jnp.maximum(better.indentation, 0.0)
+        x = jnp.where(loaded, at_least, end.indentation)
         new = better._replace(indentation=x, rate=end.rate, time=end.time)
         return new, (error + jnp.sum(losses, axis=0)) / allowed
 
@@ -570,9 +587,11 @@ def descent_of(coupling: Coupling, contacts: int) -> Float[Array, "n B"]:
     if isinstance(coupling, Dense):
         return descent_lengths(coupling.matrix, contacts)
     entries, *_ = jax.tree.leaves(coupling)
-    ones = jnp.ones((contacts, entries.shape[-1]), entries.dtype)
+    batch = entries.shape[-1]
+    ones = jnp.ones((contacts, batch), entries.dtype)
     sums = coupling.magnitude().times(ones)
-    return ones / jnp.max(sums, axis=0, keepdims=True) * jnp.ones_like(sums)
+    largest = jnp.max(sums, axis=0, keepdims=True)
+    return ones / largest * jnp.ones_like(sums)
 
 
 class ImplicitRun(NamedTuple):
@@ -596,7 +615,8 @@ def next_length(
     h^3.
     """
     # 1e-12 keeps the root from 0, far beyond GROWTH
-    factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
+    root = jnp.cbrt(error + 1e-12)
+    factor = jnp.clip(SAFETY / root, SHRINK, GROWTH)
     return jnp.where(error < jnp.inf, factor, SHRINK) * length
 
 
@@ -643,7 +663,8 @@ def run(
     """
     start = with_tangents_of((flow, start), start)
     length = FIRST * jnp.ones_like(value_of(flow.tolerance))
-    first = ImplicitRun(start, length, jnp.zeros(length.shape, jnp.int32), seen)
+    no_passes = jnp.zeros(length.shape, jnp.int32)
+    first = ImplicitRun(start, length, no_passes, seen)
 
     def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> Bool[Array, "1 B"]:
         """Mask of the impacts that are not over."""
@@ -657,7 +678,8 @@ def run(
             seen = run.seen
         else:
             seen = observe(run.seen, run.state, accepted)
-        return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), seen)
+        passes = run.passes + live.astype(jnp.int32)
+        return ImplicitRun(state, length, passes, seen)
 
     if observe is None:
         slots = SLOTS_IN_SPACE
@@ -680,7 +702,8 @@ def between(
     drifted = s.indentation - ahead * flow.omega * gamma
     length = ahead - wait
     steps = ~waits & (length > 0)
-    new, _ = flow.substep(coasted, jnp.where(steps, length, FIRST))
+    some_time = jnp.where(steps, length, FIRST)
+    new, _ = flow.substep(coasted, some_time)
     new = choose(steps, new, s)
     x = jnp.where(waits, drifted, new.indentation)
     return new._replace(indentation=x, time=s.time + ahead)

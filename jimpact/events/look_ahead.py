@@ -94,7 +94,8 @@ def comes_to_rest(
 
     def holds(s: ImplicitState) -> Float[Array, "m B"]:
         """Approach, or root of the stored energy if that is more, of each contact."""
-        return jnp.maximum(jnp.sqrt(steps.energy(s.indentation)), -s.velocity)
+        stored = jnp.sqrt(steps.energy(s.indentation))
+        return jnp.maximum(stored, -s.velocity)
 
     def size(s: ImplicitState) -> Float[Array, "1 B"]:
         """Largest approach or root of the energy of all contacts."""
@@ -113,8 +114,10 @@ def comes_to_rest(
         more than COMPARED visible errors.
         """
         held = holds(s)
-        close = (held > COMPARED * visible) & (dp - s.impulse < MARGIN * held)
-        return ~any_of(jnp.where(block, close, s.impulse > flow.tolerance))
+        carries_on = held > COMPARED * visible
+        close = carries_on & (dp - s.impulse < MARGIN * held)
+        carries = s.impulse > flow.tolerance
+        return ~any_of(jnp.where(block, close, carries))
 
     def coarse_step(steps: ImplicitSteps, look: _Look) -> _Look:
         """The look after one step tried, with errors that are a part COARSE of what is
@@ -124,7 +127,8 @@ def comes_to_rest(
         coarse = dataclasses.replace(steps, tolerance=COARSE * size(look.state))
         state, length, _ = attempt(coarse, look.state, look.length, live)
         clear = look.clear & is_clear(state)
-        return _Look(state, length, look.passes + live.astype(jnp.int32), clear)
+        passes = look.passes + live.astype(jnp.int32)
+        return _Look(state, length, passes, clear)
 
     start = steps.start(x, flow.scales(modes) * g)
     first = _Look(

@@ -153,7 +153,8 @@ def contacts_at_rest(
     works, _, _ = flow.at_work(modes, state, flow.tolerance)
     settled = ~works & (after >= -flow.tolerance)
     meets = jnp.where(often, carries, settled) & returns
-    ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
+    one_loses = any_of(often & (flow.restitution < 1))
+    ends = paused & ~any_of(~meets) & one_loses
     rest = resting | (often & ends)
     new = Rest(
         contacts=rest,
@@ -193,7 +194,8 @@ def block_at_rest(
     after = gamma + flow.coupling.times(dp)  # gamma+
     pulls = jnp.where(block, dp, 0.0) < 0
     admissible = ~any_of(pulls | (after < -flow.tolerance))
-    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & admissible)
+    asked = due & admissible
+    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, asked)
     new = rest._replace(contacts=block, carries=block, impulse=dp, ended=ended)
     return choose(ended, new, rest)
 
@@ -210,7 +212,7 @@ def plastic_impulses(
     `start`: those that are taken to carry at first.
     """
 
-    def choose(
+    def corrected(
         _: Any, last: tuple[Bool[Array, "m B"], Float[Array, "m B"]]
     ) -> tuple[Bool[Array, "m B"], Float[Array, "m B"]]:
         """Contacts that carry, less those that would pull, and those that still
@@ -221,7 +223,7 @@ def plastic_impulses(
         after = gamma + flow.coupling.times(dp)
         return allowed & jnp.where(carries, dp > 0, after < 0), dp
 
-    return fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(gamma)))
+    return fori_loop(0, CHOICES, corrected, (start, jnp.zeros_like(gamma)))
 
 
 def final_impulses(
@@ -273,6 +275,8 @@ def impulse_of_rest(
         after, _ = conjugate_step(product, scalar, now)
         return after, None
 
-    start = Iterate(jnp.zeros_like(right), right, right, scalar(right, right))
-    end, _ = scan(step, start, None, length=2 * right.shape[0])
+    zero = jnp.zeros_like(right)
+    start = Iterate(zero, right, right, scalar(right, right))
+    most = 2 * right.shape[0]
+    end, _ = scan(step, start, None, length=most)
     return end.x

@@ -87,8 +87,10 @@ class ImpactEnd(NamedTuple):
     @property
     def status(self) -> Int[Array, "1 B"]:
         """Status of the run: plastic_limit, ok, or max_steps where it is not over."""
-        code = jnp.where(any_of(self.rest.contacts), CODE["plastic_limit"], CODE["ok"])
-        return jnp.where(self.over, code, CODE["max_steps"]).astype(jnp.int32)
+        rests = any_of(self.rest.contacts)
+        code = jnp.where(rests, CODE["plastic_limit"], CODE["ok"])
+        code_if_over = jnp.where(self.over, code, CODE["max_steps"])
+        return code_if_over.astype(jnp.int32)
 
 
 class _OnItsWay(NamedTuple):
@@ -141,7 +143,8 @@ def run(
         flow, gamma = constant
         carry, accept = stepper.advance(flow, now.carry, max_passes)
         if observe is not None:
-            now = now._replace(seen=observe(now.seen, now.carry, accept))
+            new_seen = observe(now.seen, now.carry, accept)
+            now = now._replace(seen=new_seen)
         paused = carry.mark == Mark.PAUSED
         if not value_of(flow).self_similar:
             return now._replace(carry=carry)
@@ -194,4 +197,5 @@ def _finished(
 
     y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
     end = carry._replace(y=y)
-    return ImpactEnd(end, carry.y, inspect(flow, gamma, end, rest, over, True), seen)
+    rest_at_end = inspect(flow, gamma, end, rest, over, True)
+    return ImpactEnd(end, carry.y, rest_at_end, seen)

@@ -132,7 +132,8 @@ def length(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
     x, y = parts(pair)
     square = x**2 + y**2
     some = square > 0
-    return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+    positive = jnp.where(some, square, 1.0)
+    return jnp.where(some, jnp.sqrt(positive), 0.0)
 
 
 def perpendicular_to(direction: Float[Array, "m 2 B"]) -> Float[Array, "m 2 B"]:
@@ -185,7 +186,8 @@ def angle_of(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
     """Angles of directions; 0, without a derivative, of the zero vector."""
     x, y = parts(pair)
     some = (x != 0) | (y != 0)
-    return jnp.arctan2(jnp.where(some, y, 0.0), jnp.where(some, x, 1.0))
+    ahead = jnp.where(some, x, 1.0)
+    return jnp.arctan2(jnp.where(some, y, 0.0), ahead)
 
 
 def dot(a: Float[Array, "m 2 B"], b: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
@@ -222,7 +224,8 @@ class SlipFlow(FrictionFlow):
         self, y: Float[Array, "n B"], q: Float[Array, "m 2 B"]
     ) -> Float[Array, "n B"]:
         """The state with these rows of slip."""
-        return self.friction_rows(y)._replace(u=flat(q)).packed()
+        new = self.friction_rows(y)._replace(u=flat(q))
+        return new.packed()
 
     def start_with(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
@@ -252,14 +255,16 @@ class SlipFlow(FrictionFlow):
         _, slips, creeps = self.sliding(modes)
         r, _ = parts(q)  # ln r of those that slip
         creep = jnp.where(creeps, r, 0.0)
-        return jnp.where(slips, jnp.exp(jnp.where(slips, r, 0.0)), creep)
+        speed = jnp.exp(jnp.where(slips, r, 0.0))
+        return jnp.where(slips, speed, creep)
 
     def cartesian(
         self, modes: Int[Array, "modes B"], q: Float[Array, "m 2 B"]
     ) -> Float[Array, "m 2 B"]:
         """Slip u = r d of loaded contacts, of rows q."""
         _, angle = parts(q)
-        along, _ = polar(jnp.where(self.loaded(modes), angle, 0.0))
+        angle_of_loaded = jnp.where(self.loaded(modes), angle, 0.0)
+        along, _ = polar(angle_of_loaded)
         return self.speed(modes, q)[:, None] * along
 
     def allowance(
@@ -270,11 +275,14 @@ class SlipFlow(FrictionFlow):
         """
         _, slips, creeps = self.sliding(modes)
         log_r, _ = parts(self.slip(y))
-        inverse = jnp.where(slips, jnp.exp(-jnp.where(slips, log_r, 0.0)), 1.0)
-        inverse = jnp.clip(inverse, 1.0, jnp.maximum(LOOSE / self.tolerance, 1.0))
+        log_of_sliding = jnp.where(slips, log_r, 0.0)
+        inverse = jnp.where(slips, jnp.exp(-log_of_sliding), 1.0)
+        most = jnp.maximum(LOOSE / self.tolerance, 1.0)
+        inverse = jnp.clip(inverse, 1.0, most)
         slow = SLOW_ANGLE / jnp.sqrt(self.tolerance)
         angle = jnp.where(creeps, slow, inverse)
-        return self.with_slip(jnp.ones_like(y), jnp.stack([inverse, angle], 1))
+        of_slip = jnp.stack([inverse, angle], 1)
+        return self.with_slip(jnp.ones_like(y), of_slip)
 
     # ---- the protocol
 
@@ -335,9 +343,11 @@ class SlipFlow(FrictionFlow):
         creep = jnp.where(creeps, frozen.unit * grows, 0.0)
         dr = jnp.where(slips, over_r * grows, creep)
         dangle = jnp.where(slips, over_r * turns, drift + correction)
-        du = (frozen.unit * jnp.ones_like(x))[:, None] * a
+        rate_of_time = frozen.unit * jnp.ones_like(x)
+        du = rate_of_time[:, None] * a
         loaded = self.loaded(modes)[:, None]
-        fastest = over_r * (length(a) + 2 * self._stiffness(const, c))
+        speed_of_change = length(a) + 2 * self._stiffness(const, c)
+        fastest = over_r * speed_of_change
         return SlipRates(
             force=f,
             sliding=side,
@@ -410,7 +420,8 @@ class SlipFlow(FrictionFlow):
             """Accelerations `u' = K_tn F + K_tt lambda` of slip by normal and sliding
             forces.
             """
-            return pairs(times(const.pull, f) + times(const.tangent, flat(side)))
+            by_side = times(const.tangent, flat(side))
+            return pairs(times(const.pull, f) + by_side)
 
         side = -c[:, None] * direction
         a = acceleration(f, side)
@@ -437,7 +448,8 @@ class SlipFlow(FrictionFlow):
         )
         both_creep = creeps[:, None] & creeps[None]
         j = jnp.where(both_creep, j * c[None], 0.0)
-        size = largest_of(jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows))
+        rows = jnp.max(jnp.abs(j), axis=1)
+        size = largest_of(rows + jnp.abs(grows))
         size = jnp.where(size > 0, size, 1.0)
         growth = jnp.where(creeps, grows / size, 0.0)
         eye = unit(j)
@@ -449,10 +461,12 @@ class SlipFlow(FrictionFlow):
         drift = _solved(jacobian, changes)
         newton = _solved(jacobian, turns)
         lagging = j + eye * (2 * growth + away)[:, None]
-        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * lagging
+        rate_of_time = jnp.where(creeps, frozen.unit, 1.0)
+        lagging = rate_of_time[:, None] * lagging
         lag = _solved(lagging + eye * LEAST_STIFFNESS, r * drift / size)
         correction = jnp.clip(newton - lag, -1.0, 1.0)
-        return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
+        drift_of_creep = jnp.where(creeps, drift, 0.0)
+        return drift_of_creep, jnp.where(creeps, correction, 0.0)
 
     def contact_states(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
@@ -463,7 +477,8 @@ class SlipFlow(FrictionFlow):
         loaded = self.loaded(modes)
         q = self.slip(y)
         motion = self.motion(const, modes, y)
-        u = jnp.where(loaded[:, None], self.cartesian(modes, q), q)
+        cartesian = self.cartesian(modes, q)
+        u = jnp.where(loaded[:, None], cartesian, q)
         return ContactStates(
             force=motion.force,
             indentation=x,
@@ -537,7 +552,8 @@ class SlipFlow(FrictionFlow):
         slow = CREEP * jnp.sqrt(self.tolerance) * const.frozen.unit * stiffness
         creep = jnp.where(creeps, r, 0.0) - 2 * floor
         slow = (slow - creep) / (slow + jnp.abs(creep))
-        ends = jnp.where(stick, room, jnp.where(creeps, slow, 1.0))
+        otherwise = jnp.where(creeps, slow, 1.0)
+        ends = jnp.where(stick, room, otherwise)
         normal = self.normal_margins(const.frozen, modes, y)
         return jnp.concatenate([normal, stops, ends])
 
@@ -560,7 +576,8 @@ class SlipFlow(FrictionFlow):
         x, g, _ = self.rows(y)
         dx, dg, _ = self.rows(dy)
         _, df = jax.jvp(lambda x, g: self.force(const.frozen, x, g), (x, g), (dx, dg))
-        dc = jnp.where(slips | creeps, self.friction * df, 0.0)[:, None]
+        rate_of_cone = self.friction * df
+        dc = jnp.where(slips | creeps, rate_of_cone, 0.0)[:, None]
         c = jnp.where(slips | creeps, self.friction * f, 0.0)
         dangle = (c * motion.turning / motion.haste)[:, None]
         swung = dangle * perpendicular_to(motion.direction)
@@ -607,19 +624,24 @@ class SlipFlow(FrictionFlow):
         x, g, _ = self.rows(y)
         f = self.force(const.frozen, x, g)
         direction, _ = polar(angle)
-        side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * direction
-        pulled = pairs(times(const.held, f) + times(const.carried, flat(side)))
+        cone = jnp.where(slips | creeps, -self.friction * f, 0.0)
+        side = cone[:, None] * direction
+        by_side = times(const.carried, flat(side))
+        pulled = pairs(times(const.held, f) + by_side)
         away = angle_of(jnp.where(breaks[:, None], pulled, 0.0))
         log_r = jnp.log(jnp.where(grows, r, 1.0))
-        q = jnp.where(breaks[:, None], jnp.stack([jnp.zeros_like(away), away], 1), q)
-        q = jnp.where(grows[:, None], jnp.stack([log_r, angle], 1), q)
+        of_creep = jnp.stack([jnp.zeros_like(away), away], 1)
+        q = jnp.where(breaks[:, None], of_creep, q)
+        of_slip = jnp.stack([log_r, angle], 1)
+        q = jnp.where(grows[:, None], of_slip, q)
         slip = self.modes(modes).slip
         slip = jnp.where(grows, Slip.SLIPS, slip)
         slip = jnp.where(breaks, Slip.CREEPS, slip)
         after, y = self.normal_switch(modes, y, which)
         after = self.with_slip_modes(after, slip)
         remains = self.loaded(after)
-        q = jnp.where((loaded & ~remains)[:, None], u, q)
+        let_go = (loaded & ~remains)[:, None]
+        q = jnp.where(let_go, u, q)
         y = self.with_slip(y, q)
         return self.decided(after, y, stopped & remains, remains & ~loaded)
 
@@ -642,11 +664,13 @@ class SlipFlow(FrictionFlow):
         slip = self.modes(modes).slip
         loaded = self.loaded(modes)
         stick = loaded & (slip == Slip.STICKS) & ~closed
-        r = jnp.where(closed, length(q), self.speed(modes, q))
+        speed = self.speed(modes, q)
+        r = jnp.where(closed, length(q), speed)
         resting = loaded & (r <= REST * self.tolerance) & ~stick
         slips = closed & ~resting
         u = jnp.where(slips[:, None], q, 1.0)
-        of_slip = jnp.stack([jnp.log(length(u)), angle_of(u)], 1)
+        log_r = jnp.log(length(u))
+        of_slip = jnp.stack([log_r, angle_of(u)], 1)
         q = jnp.where(slips[:, None], of_slip, q)
         slip = jnp.where(slips, Slip.SLIPS, slip)
         check = any_of(stopped | (closed & resting))
@@ -657,20 +681,24 @@ class SlipFlow(FrictionFlow):
         # b = u' by normal forces and by the friction of contacts that slide on
         _, angle = parts(q)
         along, _ = polar(jax.lax.stop_gradient(angle))
-        sliding = jnp.where((to_check | ~loaded)[:, None], 0.0, along)
+        open_or_asked = (to_check | ~loaded)[:, None]
+        sliding = jnp.where(open_or_asked, 0.0, along)
         b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f)
-        b = b - times(constant.tangent, flat(cone[:, None] * sliding))
+        force_of_sliding = flat(cone[:, None] * sliding)
+        b = b - times(constant.tangent, force_of_sliding)
         inside, towards = distribute(constant.tangent, b, cone, to_check)
         angle = jnp.where(inside, 0.0, angle_of(pairs(towards)))
         begins = jnp.stack([jnp.zeros_like(angle), angle], 1)  # r = 0
-        lost = jnp.where((closed & resting)[:, None], q, 0.0)
+        to_lose = (closed & resting)[:, None]
+        lost = jnp.where(to_lose, q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)
         checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
         modes = self.with_slip_modes(modes, jnp.where(to_check, checked, slip))
         pressed = to_check & (cone > 0)
         held = pressed & inside
         begun = pressed & closed & resting & ~inside
-        return modes, self._stopped(modes, self.with_slip(y, q), lost, held, begun)
+        with_slip = self.with_slip(y, q)
+        return modes, self._stopped(modes, with_slip, lost, held, begun)
 
     def _stopped(
         self,
@@ -691,8 +719,10 @@ class SlipFlow(FrictionFlow):
         p_t = self._impulse_of_rest(q, lost, held, begun)
         p_t = p_t - jax.lax.stop_gradient(p_t)
         dg = self.as_rows(modes, times(self.normal_tangent, p_t))
-        dq = self._changes_of_slip(modes, q, pairs(times(self.tangent, p_t)))
-        state = state._replace(g=state.g + dg, u=flat(q + dq), side=state.side + p_t)
+        du = pairs(times(self.tangent, p_t))
+        dq = self._changes_of_slip(modes, q, du)
+        u = flat(q + dq)
+        state = state._replace(g=state.g + dg, u=u, side=state.side + p_t)
         return state.packed()
 
     def _impulse_of_rest(
@@ -714,10 +744,10 @@ class SlipFlow(FrictionFlow):
         basis = jnp.stack([along, across], 2)
         k = self.tangent.reshape(m, 2, m, 2, -1)
         k = jnp.einsum("iaxB,iajbB,jbyB->ixjyB", basis, k, basis)
-        inverse = pseudoinverse(
-            k.reshape(self.tangent.shape), flat(jnp.stack([held, held | begun], 1))
-        )
-        z = times(inverse, flat(-jnp.einsum("iaxB,iaB->ixB", basis, lost)))
+        rows = flat(jnp.stack([held, held | begun], 1))
+        inverse = pseudoinverse(k.reshape(self.tangent.shape), rows)
+        along_basis = jnp.einsum("iaxB,iaB->ixB", basis, lost)
+        z = times(inverse, flat(-along_basis))
         return flat(jnp.einsum("iaxB,ixB->iaB", basis, pairs(z)))
 
     def _changes_of_slip(
@@ -739,7 +769,8 @@ class SlipFlow(FrictionFlow):
         along, across = polar(jnp.where(slides, angle, 0.0))
         r = jnp.where(slips, self.speed(modes, q), 1.0)
         turn = jnp.where(slips, dot(across, du), 0.0)
-        polars = jnp.stack([dot(along, du), turn], 1) / r[:, None]
+        change = jnp.stack([dot(along, du), turn], 1)
+        polars = change / r[:, None]
         free = ~self.loaded(modes)
         dq = jnp.where(free[:, None], du, 0.0)
         return jnp.where(slides[:, None], polars, dq)

@@ -163,7 +163,8 @@ class SpringFlow(FrictionFlow):
         `k_t = kappa eta (eta + 1)/2 omega_j` at x = 1.
         """
         eta = per_row(self.exponent, self.omega)
-        k_t_omega = self.steep * (eta + 1) / 2 * self.omega * self.omega
+        k_t = self.steep * (eta + 1) / 2
+        k_t_omega = k_t * self.omega * self.omega
         of_rows = jnp.repeat(k_t_omega, self.tangents // self.contacts, axis=0)
         square = largest_of(times(jnp.abs(self.tangent), of_rows))
         if self.in_space:
@@ -174,7 +175,8 @@ class SpringFlow(FrictionFlow):
 
     def by_contact(self, rows: Float[Array, "t B"]) -> Float[Array, "m b B"]:
         """Tangential rows of each contact side by side."""
-        return rows.reshape(self.contacts, -1, *rows.shape[1:])
+        batch = rows.shape[1:]
+        return rows.reshape(self.contacts, -1, *batch)
 
     def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "t B"]:
         """Tangential velocity u."""
@@ -189,7 +191,8 @@ class SpringFlow(FrictionFlow):
         """|xi| of contacts that hold, with derivative 0 at 0."""
         square = jnp.sum(self.spring(y) ** 2, axis=1)
         some = square > 0
-        return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+        positive = jnp.where(some, square, 1.0)
+        return jnp.where(some, jnp.sqrt(positive), 0.0)
 
     def with_spring(
         self, y: Float[Array, "n B"], xi: Float[Array, "m b B"]
@@ -198,18 +201,21 @@ class SpringFlow(FrictionFlow):
         begin = 3 * self.contacts + self.tangents
         end = begin + self.tangents
         rows = xi.reshape(self.tangents, *xi.shape[2:])
-        return jnp.concatenate([y[:begin], rows, y[end:]])
+        behind = y[end:]
+        return jnp.concatenate([y[:begin], rows, behind])
 
     def start_with(
         self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state before the impact, from gamma, indentations x and slip u."""
         modes, y = self.start(gamma, x)
-        modes = self.with_slip_modes(modes, jnp.full(x.shape, Slide.HOLDS))
+        holds = jnp.full(x.shape, Slide.HOLDS)
+        modes = self.with_slip_modes(modes, holds)
         xi = jnp.zeros_like(u)
         side = jnp.zeros_like(u)
         time = y[-1:]
-        y = jnp.concatenate([*self.rows(y), u, xi, side, time])
+        normal_rows = self.rows(y)
+        y = jnp.concatenate([*normal_rows, u, xi, side, time])
         return self.closed(modes, y, self.loaded(modes))
 
     # ---- the protocol
@@ -224,11 +230,14 @@ class SpringFlow(FrictionFlow):
         """
         if not self.in_space:
             return 1.0
-        slides = self.loaded(modes) & (self.modes(modes).slip == Slide.SLIDES)
-        depth = jnp.clip(self.rows(y).x, self.tolerance, 1.0)
+        is_sliding = self.modes(modes).slip == Slide.SLIDES
+        slides = self.loaded(modes) & is_sliding
+        x = self.rows(y).x
+        depth = jnp.clip(x, self.tolerance, 1.0)
         angle = jnp.where(slides, 1 / depth, 1.0)
         ones = jnp.ones_like(y)
-        return self.with_spring(ones, jnp.stack([jnp.ones_like(angle), angle], 1))
+        of_spring = jnp.stack([jnp.ones_like(angle), angle], 1)
+        return self.with_spring(ones, of_spring)
 
     def constants(self, modes: Int[Array, "modes B"]) -> Any:
         """Factors of the normal field, and which contacts are loaded and slide."""
@@ -240,7 +249,8 @@ class SpringFlow(FrictionFlow):
         """`A mu = kappa eta omega |u|`: how fast directions turn towards u, times mu
         x.
         """
-        return self.steep * self.omega * length(self.by_contact(self.slip(y)))
+        slip = self.by_contact(self.slip(y))
+        return self.steep * self.omega * length(slip)
 
     def side(
         self,
@@ -252,7 +262,8 @@ class SpringFlow(FrictionFlow):
         """Tangential forces: holding `-kappa eta F / x xi`, sliding `-mu F n`."""
         x, *_ = self.rows(y)
         secant = quotient(f, x, where=x > 0)
-        held = -(self.steep * secant)[:, None] * self.spring(y)
+        stiffness = (self.steep * secant)[:, None]
+        held = -stiffness * self.spring(y)
         sliding = -(self.friction * f)[:, None] * n
         side = jnp.where(const.slides[:, None], sliding, held)
         return side.reshape(self.slip(y).shape)
@@ -287,18 +298,21 @@ class SpringFlow(FrictionFlow):
         moves = drags & (speed > 0)
         size = jnp.where(moves, speed, 1.0)
         fixed = jnp.array([1.0, 0.0])[None, :, None]
-        along = jnp.where(moves[:, None], u / size[:, None], fixed)
+        of_slip = u / size[:, None]
+        along = jnp.where(moves[:, None], of_slip, fixed)
         _, angle = parts(self.spring(y))
         of_angle = towards(jnp.where(slip == Slide.SLIDES, angle, 0.0))
         first = jnp.where(drags[:, None], along, of_angle)
         side = self.side(const, y, f, first)
         du = self.by_contact(self.slip_acceleration(f, side))
-        dphi = jnp.where(moves, dot(perpendicular_to(along), du) / size, 0.0)
+        across = dot(perpendicular_to(along), du)
+        dphi = jnp.where(moves, across / size, 0.0)
         # x' in time: closing g / unit, but 0 where an expansion takes no time
         unit = const.frozen.unit
         dx = quotient(const.frozen.closing * g, unit, where=unit > 0)
         pace = self.aim(y) + mu * dx  # mu (A + x')
-        lag = quotient(mu * x * dphi, pace, where=moves & (pace > 0))
+        lags = moves & (pace > 0)
+        lag = quotient(mu * x * dphi, pace, where=lags)
         direction, _ = turned((first, perpendicular_to(first)), -lag)
         return direction
 
@@ -319,20 +333,25 @@ class SpringFlow(FrictionFlow):
         u = self.by_contact(self.slip(y))
         f = self.force(frozen, x, g)
         n = self.direction(const, modes, y, f)
-        slip = self.steep * frozen.unit * jnp.sum(n * u, axis=1)
+        along = jnp.sum(n * u, axis=1)
+        slip = self.steep * frozen.unit * along
         slip = slip + self.friction * frozen.ratio * g
         holds = const.loaded & ~const.slides
-        rate = jnp.where(holds[:, None], (frozen.unit * self.omega)[:, None] * u, 0.0)
+        elongates = (frozen.unit * self.omega)[:, None] * u
+        rate = jnp.where(holds[:, None], elongates, 0.0)
         haste = jnp.ones_like(frozen.unit)
         if self.in_space:
             slides = const.slides & (self.modes(modes).slip == Slide.SLIDES)
             turns = slides & (self.friction > 0) & (x > 0)
             depth = jnp.where(turns, self.friction * x, 1.0)
-            swift = jnp.where(turns, self.steep * frozen.unit * self.omega / depth, 0.0)
+            speed_of_turn = self.steep * frozen.unit * self.omega / depth
+            swift = jnp.where(turns, speed_of_turn, 0.0)
             turning = swift * dot(perpendicular_to(n), u)
-            rate = rate + jnp.stack([jnp.zeros_like(turning), turning], 1)
+            of_angle = jnp.stack([jnp.zeros_like(turning), turning], 1)
+            rate = rate + of_angle
             haste = haste + total(swift * length(u))
-        return SpringForces(f, self.side(const, y, f, n), rate, n, slip, haste)
+        side = self.side(const, y, f, n)
+        return SpringForces(f, side, rate, n, slip, haste)
 
     def field(
         self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
@@ -378,7 +397,8 @@ class SpringFlow(FrictionFlow):
         x, *_ = self.rows(y)
         slip = self.forces(const, modes, y).slip
         ends = const.slides & (mu > 0)
-        room = (mu * x - steep * self.elongation(y)) / (mu + steep)
+        elongation = self.elongation(y)
+        room = (mu * x - steep * elongation) / (mu + steep)
         room = room + BEYOND * self.tolerance
         room = jnp.where(const.loaded & ~const.slides, room, 1.0)
         if self.in_space:
@@ -409,7 +429,8 @@ class SpringFlow(FrictionFlow):
         slip = self.modes(modes).slip
         n = self.forces(const, modes, y).direction
         direction = jnp.where(const.slides[:, None], n, xi)
-        cone = (self.friction * self.rows(y).x / self.steep)[:, None] * n
+        limit = self.friction * self.rows(y).x / self.steep
+        cone = limit[:, None] * n
         xi = jnp.where(stopped[:, None], cone, xi)
         # in space one that slides drags from now on, one that drags slides
         other = Slide.SLIDES + Slide.DRAGS - slip
@@ -445,9 +466,11 @@ class SpringFlow(FrictionFlow):
         angle = angle_of(jnp.where(which[:, None], direction, 0.0))
         rows = jnp.stack([jnp.zeros_like(angle), angle], 1)
         half = 2 * QUARTER * self.swift
-        swift = self.aim(y) > half * self.friction * self.rows(y).x
+        depth = self.rows(y).x
+        swift = self.aim(y) > half * self.friction * depth
         mode = jnp.where(swift, Slide.DRAGS, Slide.SLIDES)
-        return jnp.where(which[:, None], rows, xi), jnp.where(which, mode, slip)
+        new_xi = jnp.where(which[:, None], rows, xi)
+        return new_xi, jnp.where(which, mode, slip)
 
     def closed(
         self,
@@ -462,11 +485,14 @@ class SpringFlow(FrictionFlow):
         """
         x, g, _ = self.rows(y)
         u = self.by_contact(self.slip(y))
-        speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(u) ** 2, axis=1))
+        constant = jax.lax.stop_gradient(u)
+        speed = jnp.sqrt(jnp.sum(constant**2, axis=1))
         faster = self.steep * speed > self.friction * jnp.abs(g)
-        at_once = which & (speed > 0) & ((faster & (x <= 0)) | (self.friction <= 0))
+        leaves_cone = (faster & (x <= 0)) | (self.friction <= 0)
+        at_once = which & (speed > 0) & leaves_cone
         slip = self.modes(modes).slip
-        xi, slip = self.sliding_from(at_once, u, y, slip, self.spring(y))
+        spring = self.spring(y)
+        xi, slip = self.sliding_from(at_once, u, y, slip, spring)
         return self.with_slip_modes(modes, slip), self.with_spring(y, xi)
 
     def contact_states(
@@ -476,7 +502,8 @@ class SpringFlow(FrictionFlow):
         const = self.constants(modes)
         forces = self.forces(const, modes, y)
         states = ContactFlow.contact_states(self, modes, y)
-        square = jnp.sum(self.by_contact(forces.side) ** 2, axis=1)
+        side = self.by_contact(forces.side)
+        square = jnp.sum(side**2, axis=1)
         # twice the energy, omega k_t xi^2 over omega^2:
         # lambda^2 x / (kappa eta omega F)
         stiffness = self.steep * self.omega * forces.normal

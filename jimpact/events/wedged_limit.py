@@ -92,7 +92,8 @@ def returned(
     The new state is kept after twice as many passes as the old one.
     """
     now = cycle_at(flow, carry)
-    found, ended = compared(flow, now, rest.cycle, dragged_on(flow, carry, rest))
+    drags = dragged_on(flow, carry, rest)
+    found, ended = compared(flow, now, rest.cycle, drags)
     ended = which & ended
     due = which & ~ended & (now.passes >= 2 * rest.cycle.passes)
     cycle = choose(due, now, rest.cycle)
@@ -128,9 +129,11 @@ def compared(
     allowed = jnp.where(drags, WIDENED * flow.tolerance, allowed)
     expected = jnp.where(drags, 0.0, ratio)  # of what was
     multiple = jnp.abs(now.gamma - expected * old.gamma) <= allowed
-    multiple = multiple & (jnp.abs(now.root - expected * old.root) <= allowed)
+    same_root = jnp.abs(now.root - expected * old.root) <= allowed
+    multiple = multiple & same_root
     differs = jnp.abs(now.slip - expected * old.slip)
-    falls = drags & (jnp.abs(now.slip) <= jnp.abs(old.slip) / 2)
+    half = jnp.abs(old.slip) / 2
+    falls = drags & (jnp.abs(now.slip) <= half)
     stops = wedged & ((differs <= allowed) | falls)
     # the sum of what is left, a geometric series
     series = quotient(ratio, 1 - ratio, where=decays)
@@ -139,13 +142,15 @@ def compared(
     dgamma = flow.coupling.times(left) + times(flow.normal_tangent, left_side)
     du = times(jnp.swapaxes(flow.normal_tangent, 0, 1), left)
     du = du + times(flow.tangent, left_side)
-    is_open = (now.gamma >= 0) & (now.gamma + dgamma >= 0) & (now.root <= 0)
+    opens = now.gamma + dgamma >= 0
+    is_open = (now.gamma >= 0) & opens & (now.root <= 0)
     clear = drags | (differs > CLEARLY * allowed)
     goes_on = (now.slip * (now.slip + du) > 0) & clear
     meets = jnp.where(wedged, multiple & (stops | goes_on), is_open)
     modes = flow.modes(now.modes)
     old_modes = flow.modes(old.modes)
-    changed = (modes.phase != old_modes.phase) | (modes.slip != old_modes.slip)
+    other_phase = modes.phase != old_modes.phase
+    changed = other_phase | (modes.slip != old_modes.slip)
     same = drags | ~any_of(changed)
     ended = decays & any_of(wedged) & ~any_of(~meets) & same
     found = now._replace(impulse=left, side=left_side, wedged=wedged, stops=stops)

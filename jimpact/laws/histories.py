@@ -14,6 +14,7 @@ from jimpact.core.impacts import NOTHING_GIVEN, Traced, check_constrained
 from jimpact.core.law import Law, check_law
 from jimpact.core.scene import Scene, as_velocity, gap_velocity, velocity_change
 from jimpact.events.contact_flow import ContactStates
+from jimpact.events.impact_dynamics import Dynamics
 from jimpact.events.impact_history import history_program
 from jimpact.numerics.derive import in_lanes, naming_the_adjoint
 from jimpact.tools.checks import as_whole, check_kind, check_values, in_common_dtype
@@ -105,6 +106,25 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
 
 
 @quick_jit
+def _dimensionless(
+    dynamics: Dynamics, samples: int
+) -> tuple[jax.Array, jax.Array, ContactStates, jax.Array, jax.Array]:
+    """s samples of an impact: time (s, 1, 1), twice the energy (s, m, 1), and contact
+    states (s, m); largest forces (m,) and the status code (1,).
+    """
+    program = dynamics.program(with_end_time=True)
+    leaves, _ = dynamics.columns()
+    checkpoints = dynamics.adjoint == "checkpoints"
+    differentiated = dataclasses.replace(program, checkpoints=checkpoints)
+    programs = (
+        history_program(program, samples),
+        history_program(differentiated, samples),
+    )
+    time, energy, *rest = in_lanes(*programs, *leaves, adjoint=dynamics.adjoint)
+    *rows, maximum, code = (x[..., 0] for x in rest)
+    return time, energy, ContactStates(*rows), maximum, code
+
+
 def _history(
     law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced
 ) -> History:
@@ -121,17 +141,7 @@ def _history(
     dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
     t = dynamics.tangents
     units = dynamics.units
-    program = dynamics.program(with_end_time=True)
-    leaves, _ = dynamics.columns()
-    checkpoints = dynamics.adjoint == "checkpoints"
-    differentiated = dataclasses.replace(program, checkpoints=checkpoints)
-    programs = (
-        history_program(program, samples),
-        history_program(differentiated, samples),
-    )
-    time, energy, *rest = in_lanes(*programs, *leaves, adjoint=dynamics.adjoint)
-    *rows, maximum, code = (x[..., 0] for x in rest)
-    states = ContactStates(*rows)
+    time, energy, states, maximum, code = _dimensionless(dynamics, samples)
     unit_force = units.momentum / units.time
     unit_gamma = units.velocity * units.root
     unit_energy = 0.5 * units.velocity**2

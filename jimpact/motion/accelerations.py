@@ -46,8 +46,10 @@ class QuasiLagrange(NamedTuple):
         """
         b = self.bilateral
         push = as_float_array("force", force) * self.norm[b:]
-        rest = self.normal[:b] - self.matrix[:b, b:] @ push
-        return jnp.linalg.solve(self.matrix[:b, :b], rest) / self.norm[:b]
+        by_push = self.matrix[:b, b:] @ push
+        rest = self.normal[:b] - by_push
+        held = self.matrix[:b, :b]
+        return jnp.linalg.solve(held, rest) / self.norm[:b]
 
     @full_precision
     def rates(
@@ -58,10 +60,10 @@ class QuasiLagrange(NamedTuple):
 
         Equation: `qn' = G lambda_bar - F_norm`, `qt' = -F_tan`.
         """
-        push = as_float_array("force", force) * jnp.ones_like(
-            self.norm[self.bilateral :]
-        )
-        every = jnp.concatenate([self.bilateral_forces(push), push]) * self.norm
+        one = jnp.ones_like(self.norm[self.bilateral :])
+        push = as_float_array("force", force) * one
+        held = self.bilateral_forces(push)
+        every = jnp.concatenate([held, push]) * self.norm
         return self.matrix @ every - self.normal, -self.tangential
 
 
@@ -158,21 +160,23 @@ def _terms(
         s.
         """
         scene = scene_at(s * v)
-        return jnp.concatenate(quasi_basis(scene), axis=1).T @ momentum(scene, w)
+        both = jnp.concatenate(quasi_basis(scene), axis=1)
+        return both.T @ momentum(scene, w)
 
     scene = scene_at(jnp.zeros_like(v))
-    free = free_acceleration(
-        system, q, v, user_force(system, q, v, t), mass_at(system, q)
-    )
+    push = user_force(system, q, v, t)
+    free = free_acceleration(system, q, v, push, mass_at(system, q))
     zero = jnp.zeros((), v.dtype)
     # derivative at s = 0 along (1, q''): d/dt (Xi M q')
-    _, rate = jax.jvp(quasi, (zero, v), (jnp.ones_like(zero), free))
+    along = (jnp.ones_like(zero), free)
+    _, rate = jax.jvp(quasi, (zero, v), along)
     normal, _ = quasi_basis(scene)
     metric = jax.vmap(lambda x: momentum(scene, x), 1, 1)(normal)
     directions = scene.normals
     norm = jnp.sum(directions * normal, axis=0)  # grad f^T M^-1 grad f / |grad f|
     count = directions.shape[1]
-    return QuasiLagrange(-rate[:count], -rate[count:], normal.T @ metric, norm, 0)
+    coupling = normal.T @ metric
+    return QuasiLagrange(-rate[:count], -rate[count:], coupling, norm, 0)
 
 
 class ContactProblem(NamedTuple):
@@ -189,7 +193,8 @@ class ContactProblem(NamedTuple):
         """Forces lambda [N] at the contacts that are `closed` (m,), with gap velocity
         0.
         """
-        held = jnp.broadcast_to(jnp.asarray(closed, bool), self.free.shape)
+        mask = jnp.asarray(closed, bool)
+        held = jnp.broadcast_to(mask, self.free.shape)
         return _forces(self.delassus, self.free, held)
 
 
@@ -202,7 +207,9 @@ def _forces(
     """
     both = held[:, None] & held[None, :]
     unit = jnp.eye(len(held), dtype=free.dtype)
-    return solve_lcp(jnp.where(both, delassus, unit), jnp.where(held, free, 1.0)).z
+    matrix = jnp.where(both, delassus, unit)
+    offset = jnp.where(held, free, 1.0)
+    return solve_lcp(matrix, offset).z
 
 
 def contact_problem(

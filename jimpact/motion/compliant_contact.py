@@ -137,12 +137,14 @@ def tangential_stiffness_of(law: Law, start: Start) -> Float[Array, " m"] | None
             "contact forces of bodies that touch each other, whose tangents turn: it "
             f"is for contacts with planes, but {type(body).__name__} has pairs."
         )
-    return jnp.broadcast_to(kappa, (start.contacts,)).astype(start.q.dtype)
+    of_contacts = jnp.broadcast_to(kappa, (start.contacts,))
+    return of_contacts.astype(start.q.dtype)
 
 
 def _touch_each_other(body: Bodies) -> bool:
     """True if a contact is between two bodies; the second one of a plane is -1."""
-    return bool((body.pairs_in_contact() >= 0).all(axis=1).any())
+    bodies = body.pairs_in_contact()
+    return bool((bodies >= 0).all(axis=1).any())
 
 
 def compliant_motion(
@@ -160,13 +162,15 @@ def _start(problem: MotionProblem) -> State:
     yet, springs xi = 0.
     """
     gap = gaps(problem.system, problem.q0, problem.times[0])
-    x = jnp.where(jnp.abs(gap) <= problem.settings.closed_below, 0.0, -gap)
+    closed = jnp.abs(gap) <= problem.settings.closed_below
+    x = jnp.where(closed, 0.0, -gap)
     if problem.mu is None:
         each = 0
     else:
         each = problem.tangents // problem.contacts
     impulses = jnp.zeros((1 + each, len(x)), x.dtype)
-    start = problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
+    contact = jnp.concatenate([x[None], impulses])
+    start = problem.start._replace(contact=contact)
     if problem.tangential_stiffness is None:
         return start
     return start._replace(spring=impulses[1:])
@@ -188,7 +192,8 @@ def _run(max_events: int, until_apart: bool, problem: MotionProblem) -> MotionEn
 
     one = partial(_one_pass, max_events)
     last = until_over(continues, one, problem, _begin(problem, max_events))
-    return end_of(problem, last, jnp.stack([last.flight.sample, last.event_count]))
+    smooth = jnp.stack([last.flight.sample, last.event_count])
+    return end_of(problem, last, smooth)
 
 
 def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
@@ -205,11 +210,11 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     state = _start(problem)
     gamma, slip = _rates(problem, state)
     x = state.contact[0]
-    phase = jnp.where(
-        (x > 0) | ((x == 0) & (gamma <= 0)), Phase.COMPRESSION, Phase.OPEN
-    )
+    compressed = (x > 0) | ((x == 0) & (gamma <= 0))
+    phase = jnp.where(compressed, Phase.COMPRESSION, Phase.OPEN)
     if not force.slackens:
-        phase = jnp.where((x > 0) & (gamma > 0), Phase.EXPANSION, phase)
+        expands = (x > 0) & (gamma > 0)
+        phase = jnp.where(expands, Phase.EXPANSION, phase)
     phase = phase.astype(jnp.int32)
     margins = 2 * m
     fastest = jnp.maximum(-gamma, 0.0)
@@ -232,7 +237,8 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
         stable = stable_step(force, flight.aim.modes, contacts, state)
     flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
     # friction is to be decided
-    flight = flight._replace(event=flight.event.at[:m].set(True))
+    decide = flight.event.at[:m].set(True)
+    flight = flight._replace(event=decide)
     return _CompliantRun(
         flight=flight,
         fastest=jax.lax.stop_gradient(fastest),
@@ -248,9 +254,8 @@ def _rates(
     problem: MotionProblem, at: State
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Gap velocities f' and speeds of slip |u| [m/s], these 0 without friction."""
-    normal, tangent = kinematics(
-        problem.system, at.q, at.v, at.t, problem.mu is not None
-    )
+    rubs = problem.mu is not None
+    normal, tangent = kinematics(problem.system, at.q, at.v, at.t, rubs)
     if tangent is None:
         return normal.rate, jnp.zeros_like(normal.rate)
     return normal.rate, length(by_contact(tangent.rate, problem.contacts))
@@ -260,73 +265,85 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
     """Run with new modes of friction after an event: contacts whose force acts stick or
     slide.
 
+    Without an event modes remain, and with tangential springs, which decide by
+    themselves.
+    """
+    if problem.mu is None or problem.tangential_stiffness is not None:
+        return run
+    event = run.flight.event
+    old = run.flight.aim.modes, jnp.asarray(True)
+    happened = jnp.any(event)
+    new = jax.lax.cond(
+        any_lane(happened), lambda: _new_modes(problem, run), lambda: old
+    )
+    modes, consistent = choose(happened, new, old)
+    code = jnp.where(consistent, run.status, CODE["no_contact_force"])
+    status = code.astype(jnp.int32)
+    aim = run.flight.aim._replace(modes=modes)
+    flight = run.flight._replace(aim=aim)
+    return run._replace(flight=flight, status=status)
+
+
+def _new_modes(
+    problem: MotionProblem, run: _CompliantRun
+) -> tuple[Int[Array, "k 1"], Bool[Array, ""]]:
+    """Rows of the new modes of friction, and true if they are consistent.
+
     Contacts with slip slide. All others stick if forces with normal forces F of the law
     hold them: `|a_t| <= within` at `|lambda_t| <= mu F`; else modes solve
-    `choose_with_friction` for given normal forces. Without an event modes remain, and
-    with tangential springs, which decide by themselves.
+    `choose_with_friction` for given normal forces.
     """
     system, force, mu, settings, *_ = problem
-    if mu is None or problem.tangential_stiffness is not None:
-        return run
+    assert mu is not None
     at = run.flight.state
     m = problem.contacts
     event = run.flight.event
-
-    def decided() -> tuple[Int[Array, "k 1"], Bool[Array, ""]]:
-        """Rows of the new modes, and true if they are consistent."""
-        phase, before = contact_modes(run.flight.aim.modes, at)
-        contacts = contacts_at(system, at.q, at.v, at.t, True)
-        # by F
-        pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))
-        scale = jnp.max(run.fastest)
-        slip = _rates(problem, at)[1]
-        stopped = slip_stops(settings, before, event[2 * m :], slip, scale)
-        # friction has reached its limit
-        let_go = (event[2 * m :] & before.stick) | stopped
-        released = jnp.concatenate([jnp.zeros_like(let_go), let_go])
-        # largest acceleration: a share is rounding
-        fastest = jnp.max(jnp.abs(pushed.approach))
-        rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(
-            settings, fastest
-        )
-        slides = (slip > rest) & ~stopped
-        slack = rest_acceleration(slip.dtype) * fastest
-        acts = loaded(phase)
-        choice = choose_with_friction(pushed, mu, before, acts, released, slides, slack)
-        # corners that sink in differently are nearly redundant: they stick where the
-        # forces of the flow, which share what they hold, can hold them
-        assert pushed.tangent is not None
-        moves = direction(by_contact(pushed.tangent.rate, m))  # of the slip
-        sticking = Modes(acts, acts & ~slides, jnp.where(slides, moves[:, 0], 1.0))
-        if settings.spatial:
-            sticking = sticking._replace(sign=jnp.ones_like(sticking.sign))
-        held = forces(pushed, mu, sticking, jnp.where(slides[:, None], moves, 0.0))
-        left = cone_margins(pushed, mu, held)  # [m/s^2] to the rim
-        within = WITHIN * friction_acceleration(pushed, mu, held.normal)
-        # what passes the flat position turns: no forces hold both of its corners
-        assert held.tangential is not None
-        both = jnp.concatenate([held.normal, held.tangential])
-        # slip acceleration of contacts that stick: not 0 where forces cannot hold them
-        growth = length(by_contact((pushed.approach + pushed.delassus @ both)[m:], m))
-        holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))
-        sticks = jnp.all(~sticking.stick | holds)
-        chosen = choose(sticks, sticking, choice.modes)
-        # a force that changes as fast as in a contact has slip begin at once
-        if settings.spatial:
-            chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
-        return mode_rows(ContactModes(phase, chosen))[
-            :, None
-        ], choice.consistent | sticks
-
-    old = run.flight.aim.modes, jnp.asarray(True)
-    happened = jnp.any(event)
-    new = jax.lax.cond(any_lane(happened), decided, lambda: old)
-    modes, consistent = choose(happened, new, old)
-    status = jnp.where(consistent, run.status, CODE["no_contact_force"]).astype(
-        jnp.int32
+    phase, before = contact_modes(run.flight.aim.modes, at)
+    contacts = contacts_at(system, at.q, at.v, at.t, True)
+    # by F
+    pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))
+    scale = jnp.max(run.fastest)
+    slip = _rates(problem, at)[1]
+    stopped = slip_stops(settings, before, event[2 * m :], slip, scale)
+    # friction has reached its limit
+    let_go = (event[2 * m :] & before.stick) | stopped
+    released = jnp.concatenate([jnp.zeros_like(let_go), let_go])
+    # largest acceleration: a share is rounding
+    fastest = jnp.max(jnp.abs(pushed.approach))
+    rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(
+        settings, fastest
     )
-    aim = run.flight.aim._replace(modes=modes)
-    return run._replace(flight=run.flight._replace(aim=aim), status=status)
+    slides = (slip > rest) & ~stopped
+    slack = rest_acceleration(slip.dtype) * fastest
+    acts = loaded(phase)
+    choice = choose_with_friction(pushed, mu, before, acts, released, slides, slack)
+    # corners that sink in differently are nearly redundant: they stick where the
+    # forces of the flow, which share what they hold, can hold them
+    assert pushed.tangent is not None
+    moves = direction(by_contact(pushed.tangent.rate, m))  # of the slip
+    sign = jnp.where(slides, moves[:, 0], 1.0)
+    sticking = Modes(acts, acts & ~slides, sign)
+    if settings.spatial:
+        sticking = sticking._replace(sign=jnp.ones_like(sticking.sign))
+    along = jnp.where(slides[:, None], moves, 0.0)
+    held = forces(pushed, mu, sticking, along)
+    left = cone_margins(pushed, mu, held)  # [m/s^2] to the rim
+    within = WITHIN * friction_acceleration(pushed, mu, held.normal)
+    # what passes the flat position turns: no forces hold both of its corners
+    assert held.tangential is not None
+    both = jnp.concatenate([held.normal, held.tangential])
+    # slip acceleration of contacts that stick: not 0 where forces cannot hold them
+    acceleration = pushed.approach + pushed.delassus @ both
+    growth = length(by_contact(acceleration[m:], m))
+    least = jnp.where(let_go, within, 0.0)
+    holds = (growth <= within) & (left >= least)
+    sticks = jnp.all(~sticking.stick | holds)
+    chosen = choose(sticks, sticking, choice.modes)
+    # a force that changes as fast as in a contact has slip begin at once
+    if settings.spatial:
+        chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
+    new_rows = mode_rows(ContactModes(phase, chosen))
+    return new_rows[:, None], choice.consistent | sticks
 
 
 def _one_pass(
@@ -339,7 +356,6 @@ def _one_pass(
     or stops.
     """
     run = _with_friction(problem, run)
-    system = problem.system
     times = problem.times
     flight = run.flight
     m = problem.contacts
@@ -351,15 +367,7 @@ def _one_pass(
     else:
         flow = compliant_flow(*given)
     settings = problem.settings
-    # errors of time and works, then of indentations and impulses by the scales of the
-    # contacts
-    without = flight.state._replace(contact=flight.state.contact[:0], spring=())
-    ledger = allowed_errors(system, settings, without, 1.0)
-    depth = flow.scales.depth
-    impulse = flow.scales.impulse
-    sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
-    sizes.extend(flow.sizes_of_springs(flight.state))
-    allowed = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
+    allowed = _allowed_errors(problem, flow, flight.state)
     flown, _ = one_pass(flow, settings, allowed, times, flight)
     before = flight.aim.modes[:m, 0]
     after = flown.aim.modes[:m, 0]
@@ -389,10 +397,7 @@ def _one_pass(
     full = happened & (run.event_count >= max_events)  # no row is left
     written = happened & ~full
     status = jnp.where(full, CODE["max_events"], run.status)
-    kind = jnp.where(jnp.any(opened), KIND_CODE["detachment"], KIND_CODE["friction"])
-    kind = jnp.where(jnp.any(closed), KIND_CODE["contact"], kind)
-    some = (closed | opened | turned).astype(kind.dtype)
-    marks = jnp.concatenate([jnp.stack([kind, 0 * kind]), some])  # no status of a law
+    marks = _marks(closed, opened, turned)
     row = jnp.where(written, run.event_count, max_events)
     table = run.table.with_sample(at, flight.sample)
     return _CompliantRun(
@@ -404,6 +409,38 @@ def _one_pass(
         apart=jnp.all((after == Phase.OPEN) & (gamma >= 0)),
         vanished=vanished,
     )
+
+
+def _allowed_errors(
+    problem: MotionProblem, flow: CompliantFlow, at: State
+) -> Float[Array, " rows"]:
+    """Errors that a step may make in the rows of the state but q and v: in time and
+    works, then in indentations, impulses and springs by the scales of the contacts.
+    """
+    settings = problem.settings
+    without = at._replace(contact=at.contact[:0], spring=())
+    ledger = allowed_errors(problem.system, settings, without, 1.0)
+    impulses = len(at.contact) - 1
+    sizes = [flow.scales.depth, *[flow.scales.impulse] * impulses]
+    sizes.extend(flow.sizes_of_springs(at))
+    of_contacts = settings.rtol * jnp.concatenate(sizes)
+    return jnp.concatenate([ledger, of_contacts])
+
+
+def _marks(
+    closed: Bool[Array, " m"], opened: Bool[Array, " m"], turned: Bool[Array, " m"]
+) -> Int[Array, " marks"]:
+    """Marks of an event: its kind, no status of a law, and the contacts that take part.
+
+    Kind: `contact` where one closed, else `detachment` where one opened, else
+    `friction`.
+    """
+    any_opened = jnp.any(opened)
+    kind = jnp.where(any_opened, KIND_CODE["detachment"], KIND_CODE["friction"])
+    kind = jnp.where(jnp.any(closed), KIND_CODE["contact"], kind)
+    no_law = 0 * kind
+    some = (closed | opened | turned).astype(kind.dtype)
+    return jnp.concatenate([jnp.stack([kind, no_law]), some])
 
 
 def _ended_slip(
@@ -425,14 +462,17 @@ def _ended_slip(
     """
     m = problem.contacts
     most = problem.settings.max_steps
-    scale = jnp.maximum(jnp.max(run.fastest), jnp.max(slip))
+    fastest = jnp.max(run.fastest)
+    scale = jnp.maximum(fastest, jnp.max(slip))
     ends = friction.active & ~friction.stick & (slip <= STOPPED * scale)
-    vanished = flown.stuck & (flown.steps < most) & (flown.state.t > run.vanished)
+    some_left = flown.steps < most
+    vanished = flown.stuck & some_left & (flown.state.t > run.vanished)
     here = vanished & jnp.any(ends)
     event = flown.event.at[2 * m :].set(ends)
     goes_on = flown._replace(event=event, stuck=jnp.asarray(False))
     again = toward_sample(goes_on, problem.times, flown.free)
-    return choose(here, again, flown), jnp.where(here, flown.state.t, run.vanished)
+    last = jnp.where(here, flown.state.t, run.vanished)
+    return choose(here, again, flown), last
 
 
 def _event(
@@ -446,5 +486,6 @@ def _event(
     push, *tangential = jnp.where(opened, at.contact[1:], 0.0)
     jump = none._replace(impulse=push)
     if tangential:
-        jump = jump._replace(tangential=jnp.stack(tangential, axis=1).reshape(-1))
+        by_tangent = jnp.stack(tangential, axis=1)
+        jump = jump._replace(tangential=by_tangent.reshape(-1))
     return event_numbers(at, After(at, jump, Passed(zero, zero)))

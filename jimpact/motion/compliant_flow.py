@@ -90,9 +90,8 @@ def contact_scales(
     depth = force.indentation_scale(0.5 * speed**2 / w)
     push = force.force(depth, jnp.zeros_like(depth))
     onset = force.onset_scale(depth, speed)
-    return jax.lax.stop_gradient(
-        ContactScales(speed, depth, push, onset, speed / w, slip)
-    )
+    scales = ContactScales(speed, depth, push, onset, speed / w, slip)
+    return jax.lax.stop_gradient(scales)
 
 
 class CompliantFlow(MotionFlow):
@@ -151,9 +150,8 @@ class CompliantFlow(MotionFlow):
         friction, base = contact_powers(self.system, contacts, force, at.t)
         remembered = [closing, push]
         if force.tangential is not None:
-            remembered.extend(
-                by_contact(self.along_tangents(force.tangential), len(push)).T
-            )
+            along = self.along_tangents(force.tangential)
+            remembered.extend(by_contact(along, len(push)).T)
         rates = State(
             q=self.system.body.rates(at.q, at.v),
             v=force.acceleration,
@@ -164,7 +162,8 @@ class CompliantFlow(MotionFlow):
             contact=jnp.stack(remembered),
             spring=self.spring_rates(const, at, contacts, force),
         )
-        return jnp.concatenate(self.rows_of(rates, at, const.friction, contacts, force))
+        rows = self.rows_of(rates, at, const.friction, contacts, force)
+        return jnp.concatenate(rows)
 
     def spring_rates(
         self, const: ContactModes, at: State, contacts: Contacts, force: Forces
@@ -183,7 +182,8 @@ class CompliantFlow(MotionFlow):
         if self.axes is None:
             return tangential
         each = by_contact(tangential, len(self.axes.along))
-        return jnp.einsum("mj,mjk->mk", each, slip_frames(self.axes.along)).reshape(-1)
+        frames = slip_frames(self.axes.along)
+        return jnp.einsum("mj,mjk->mk", each, frames).reshape(-1)
 
     def margins(
         self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
@@ -193,15 +193,16 @@ class CompliantFlow(MotionFlow):
         """
         at = unpacked(self.like, y)
         if self.mu is None:
-            rate = kinematics(self.system, at.q, at.v, at.t)[0].rate
-            return self.from_margins(
-                self._normal_margins(const.phase, rate, at.contact[0]), at
-            )
+            rates, _ = kinematics(self.system, at.q, at.v, at.t)
+            margins = self._normal_margins(const.phase, rates.rate, at.contact[0])
+            return self.from_margins(margins, at)
         contacts, force = self.contact_forces(const, at)
-        normal = self._normal_margins(const.phase, contacts.normal.rate, at.contact[0])
+        x = at.contact[0]
+        normal = self._normal_margins(const.phase, contacts.normal.rate, x)
         zero = jnp.zeros_like(at.t)
+        one = zero + 1
         friction = friction_margins(
-            contacts, self.mu, const.friction, force, zero + 1, zero, self.scales.slip
+            contacts, self.mu, const.friction, force, one, zero, self.scales.slip
         )
         return self.from_margins(jnp.concatenate([normal, friction]), at)
 
@@ -224,16 +225,16 @@ class CompliantFlow(MotionFlow):
         gamma = rate / self.scales.speed
         depth = x / self.scales.depth
         if self.force.slackens:
-            onset = (
-                self.force.onset(jnp.where(x >= 0, x, 0.0), -rate) / self.scales.onset
-            )
+            inside = jnp.where(x >= 0, x, 0.0)
+            onset = self.force.onset(inside, -rate) / self.scales.onset
             by_x = jnp.where(const == Phase.COMPRESSION, onset, -onset)
             by_g = depth
         else:
             by_x = jnp.where(const == Phase.EXPANSION, depth, 1.0)
             by_g = jnp.where(const == Phase.COMPRESSION, -gamma, gamma)
         by_x = jnp.where(const == Phase.OPEN, -depth, by_x)
-        return jnp.concatenate([by_x, jnp.where(const == Phase.OPEN, 1.0, by_g)])
+        by_rate = jnp.where(const == Phase.OPEN, 1.0, by_g)
+        return jnp.concatenate([by_x, by_rate])
 
     def rooted(self, modes: Int[Array, "k 1"]) -> Bool[Array, "margins 1"]:
         """True for margins of opening: landings on them step in the root of the
@@ -242,7 +243,8 @@ class CompliantFlow(MotionFlow):
         phase = self.constants(modes).phase[:, None]
         opens = phase == Phase.EXPANSION
         by_g = (phase == Phase.COMPRESSION) & self.force.slackens
-        rest = jnp.zeros((self.rounding.shape[0] - 2 * opens.shape[0], 1), bool)
+        others = self.rounding.shape[0] - 2 * opens.shape[0]
+        rest = jnp.zeros((others, 1), bool)
         return jnp.concatenate([opens, by_g, rest])
 
     def switch(
@@ -280,25 +282,26 @@ class CompliantFlow(MotionFlow):
         by_g = which[m : 2 * m, 0]
         closed = by_x & (phase == Phase.OPEN)
         if self.force.slackens:
-            after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
-            after = jnp.where(by_x & (phase == Phase.SLACK), Phase.COMPRESSION, after)
+            slackens = by_x & (phase == Phase.COMPRESSION)
+            after = jnp.where(slackens, Phase.SLACK, phase)
+            tightens = by_x & (phase == Phase.SLACK)
+            after = jnp.where(tightens, Phase.COMPRESSION, after)
             opened = by_g
         else:
             turned = by_g & (phase == Phase.COMPRESSION)
             after = jnp.where(turned, Phase.EXPANSION, phase)
-            after = jnp.where(
-                by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after
-            )
+            returns = by_g & (phase == Phase.EXPANSION)
+            after = jnp.where(returns, Phase.COMPRESSION, after)
             opened = by_x & (phase == Phase.EXPANSION)
             if self.force.bistiffness is not None:  # e = 0 returns nothing
                 opened = opened | (turned & (self.force.bistiffness.restitution == 0))
-        after = jnp.where(
-            opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after)
-        )
+        otherwise = jnp.where(closed, Phase.COMPRESSION, after)
+        after = jnp.where(opened, Phase.OPEN, otherwise)
         x = at.contact[:1]
         impulses = at.contact[1:]
         indentation = jnp.where(opened | closed, 0.0, x)
-        contact = jnp.concatenate([indentation, jnp.where(closed, 0.0, impulses)])
+        kept_impulses = jnp.where(closed, 0.0, impulses)
+        contact = jnp.concatenate([indentation, kept_impulses])
         return after, at._replace(contact=contact)
 
     def begins(
@@ -338,18 +341,16 @@ class CompliantFlow(MotionFlow):
         contacts = self.contacts(at)
         known = with_normal_forces(contacts, jnp.zeros_like(contacts.normal.rate))
         assert known.tangent is not None
-        rates = jnp.concatenate(
-            [jnp.zeros_like(contacts.normal.rate), known.tangent.rate]
-        )
+        zero = jnp.zeros_like(contacts.normal.rate)
+        rates = jnp.concatenate([zero, known.tangent.rate])
         if straight and self.axes is not None:
             modes = straightened(self.axes, modes, known.tangent.rate)
         if straight:
             acts = modes.stick | (modes.sign == BEGINS)
         else:
             acts = modes.stick
-        p = constraint_impulse(
-            known, self.mu, modes._replace(active=modes.active & acts), rates
-        )
+        held = modes._replace(active=modes.active & acts)
+        p = constraint_impulse(known, self.mu, held, rates)
         return at._replace(v=at.v + contacts.moved @ p)
 
 
@@ -363,8 +364,10 @@ def normal_forces(
 ) -> Float[Array, " m"]:
     """Normal forces F(x, -f') >= 0 [N] of the loaded contacts, 0 of others."""
     x = at.contact[0]
-    push = force.force(jnp.where(x >= 0, x, 0.0), -contacts.normal.rate)
-    return jnp.where(loaded(phase), jnp.maximum(push, 0.0), 0.0)
+    inside = jnp.where(x >= 0, x, 0.0)
+    push = force.force(inside, -contacts.normal.rate)
+    pressing = jnp.maximum(push, 0.0)
+    return jnp.where(loaded(phase), pressing, 0.0)
 
 
 def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
@@ -378,16 +381,19 @@ def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
         return ContactModes(phase, none)
     stick, sign = modes[m:, 0].reshape(2, -1)
     acts = loaded(phase) & ((stick > 0) | (sign != 0))
-    return ContactModes(phase, Modes(acts, stick > 0, sign.astype(none.sign.dtype)))
+    direction_of_slip = sign.astype(none.sign.dtype)
+    return ContactModes(phase, Modes(acts, stick > 0, direction_of_slip))
 
 
 def mode_rows(now: ContactModes) -> Int[Array, " rows"]:
     """Rows (3 m) of phases and of friction: phase, stick, sign; both 0 where no
     friction acts.
     """
-    friction = jnp.stack([x.astype(jnp.int32) for x in now.friction[1:]])
+    stick_and_sign = now.friction[1:]
+    friction = jnp.stack([x.astype(jnp.int32) for x in stick_and_sign])
     friction = jnp.where(now.friction.active, friction, 0)
-    return jnp.concatenate([now.phase.astype(jnp.int32), *friction])
+    phase = now.phase.astype(jnp.int32)
+    return jnp.concatenate([phase, *friction])
 
 
 def compliant_flow(
@@ -408,12 +414,14 @@ def compliant_flow(
     settings = problem.settings
     times = problem.times
     m = problem.contacts
-    contacts = contacts_at(system, at.q, at.v, at.t, mu is not None)
+    rubs = mu is not None
+    contacts = contacts_at(system, at.q, at.v, at.t, rubs)
     scales = contact_scales(force, contacts, fastest)
     axes = None
     by_depth = jnp.full(m, SNAP * settings.rtol, at.q.dtype)
     noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
-    rounding = jnp.concatenate([by_depth, jnp.maximum(by_depth, noise / scales.speed)])
+    by_speed = jnp.maximum(by_depth, noise / scales.speed)
+    rounding = jnp.concatenate([by_depth, by_speed])
     if mu is not None:
         phase, now = contact_modes(modes, at)  # now: modes of friction
         push = normal_forces(force, phase, contacts, at)
@@ -423,14 +431,14 @@ def compliant_flow(
         largest = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
         by_slip = now.active & ~now.stick
         rest = rest_acceleration(at.q.dtype)
-        friction = jnp.where(
-            by_slip, jnp.maximum(rest * scales.slip, noise), rest * largest
-        )
+        of_slip = jnp.maximum(rest * scales.slip, noise)
+        friction = jnp.where(by_slip, of_slip, rest * largest)
         rounding = jnp.concatenate([rounding, friction])
     rounded = roundings(rounding, times)
     longest = longest_step(system, times)
     longest = jnp.minimum(longest, stable_step(force, modes, contacts, at))
-    blank = jnp.zeros((len(packed(at)), 1), at.q.dtype)
+    rows = len(packed(at))
+    blank = jnp.zeros((rows, 1), at.q.dtype)
     return CompliantFlow(
         system=system,
         rounding=rounded,
@@ -472,10 +480,13 @@ def stable_step(
     stiffness = stiffness_of(force, x, rate)
     one = jnp.ones_like(x)
     _, damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))
-    both = jnp.stack([unloading(force, phase, stiffness), damping], axis=1)
+    steep = unloading(force, phase, stiffness)
+    both = jnp.stack([steep, damping], axis=1)
     both = jnp.where(loaded(phase)[:, None], both, 0.0)
-    square, rate = jnp.max(jnp.abs(contacts.delassus[:m, :m]) @ jnp.abs(both), axis=0)
-    fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(square), rate))
+    w = jnp.abs(contacts.delassus[:m, :m])
+    square, rate = jnp.max(w @ jnp.abs(both), axis=0)
+    frequency = jnp.sqrt(square)
+    fastest = jax.lax.stop_gradient(jnp.maximum(frequency, rate))
     return quotient(STABLE, fastest, where=fastest > 0, otherwise=jnp.inf)
 
 
@@ -489,5 +500,6 @@ def unloading(
     """
     if force.bistiffness is None:
         return rate
-    e = jnp.where(force.bistiffness.restitution > 0, force.bistiffness.restitution, 1.0)
+    restitution = force.bistiffness.restitution
+    e = jnp.where(restitution > 0, restitution, 1.0)
     return jnp.where(phase == Phase.EXPANSION, rate / e**2, rate)

@@ -45,7 +45,9 @@ def base_velocity(system: System, t: Float[Array, ""]) -> Float[Array, " n"] | N
     """
     if system.base is None:
         return None
-    return jax.jvp(lambda s: _displaced(system, s), (t,), (jnp.ones_like(t),))[1]
+    one = jnp.ones_like(t)
+    _, rate = jax.jvp(lambda s: _displaced(system, s), (t,), (one,))
+    return rate
 
 
 def carried_along(
@@ -82,7 +84,8 @@ def gaps(
     system: System, q: Float[Array, " nq"], t: Float[Array, ""]
 ) -> Float[Array, " m"]:
     """Gaps f [m] of the configuration seen from the base."""
-    return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
+    seen = seen_from_base(system, q, t)
+    return jnp.atleast_1d(system.body.gap_function(seen))
 
 
 def is_pile(system: System) -> bool:
@@ -141,13 +144,14 @@ def kinematics(
 
     both = _along(system, q, v, t, all_directions)
     m = len(both.value)
-    normal = Kinematics(both.value, both.rate[:m], both.drift[:m], both.gradient[:, :m])
+    gradient = both.gradient[:, :m]
+    normal = Kinematics(both.value, both.rate[:m], both.drift[:m], gradient)
     if not friction:
         return normal, None
     slip = both.rate[m:]
-    return normal, Kinematics(
-        jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:]
-    )
+    zero = jnp.zeros_like(slip)
+    tangent = Kinematics(zero, slip, both.drift[m:], both.gradient[:, m:])
+    return normal, tangent
 
 
 def _differentiated(
@@ -171,9 +175,8 @@ def _differentiated(
         return jax.jvp(value_at, (u, s), along)
 
     (value, rate), (_, drift) = jax.jvp(gaps_and_rates, here, along)
-    return Kinematics(
-        value, rate, drift, system.body.normals(seen_from_base(system, q, t))
-    )
+    normals = system.body.normals(seen_from_base(system, q, t))
+    return Kinematics(value, rate, drift, normals)
 
 
 def _in_time(
@@ -185,7 +188,8 @@ def _in_time(
     Only the rate depends on v, so that different velocities at one q share all other
     operations.
     """
-    return (jnp.zeros_like(v), jnp.zeros_like(t)), (v, jnp.ones_like(t))
+    point = jnp.zeros_like(v), jnp.zeros_like(t)
+    return point, (v, jnp.ones_like(t))
 
 
 def _along(
@@ -211,7 +215,8 @@ def _along(
         """Rates `D^T (v - B y_b')` after the displacement u and the time s; values and
         D there.
         """
-        value, h = directions(seen_from_base(system, system.body.nearby(q, u), t + s))
+        displaced = system.body.nearby(q, u)
+        value, h = directions(seen_from_base(system, displaced, t + s))
         carried = base_velocity(system, t + s)
         rate = h.T @ (v if carried is None else v - carried)
         return rate, (value, h)
@@ -230,7 +235,8 @@ def definite(mass: Mass) -> Bool[Array, ""]:
     if mass.ndim == 1:
         return jnp.all(mass > 0)
     mass = jax.lax.stop_gradient(mass)
-    return jnp.all(jnp.isfinite(solve_mass_matrix(mass, mass[:, 0])))
+    solved = solve_mass_matrix(mass, mass[:, 0])
+    return jnp.all(jnp.isfinite(solved))
 
 
 @full_precision
@@ -257,7 +263,8 @@ def user_force(
     """
     if system.force is None:
         return jnp.zeros_like(v)
-    return jnp.asarray(system.force(q, v, t)).astype(v.dtype)
+    force = jnp.asarray(system.force(q, v, t))
+    return force.astype(v.dtype)
 
 
 def free_acceleration(
@@ -274,5 +281,6 @@ def free_acceleration(
     """
     total = force
     if system.potential is not None:
-        total = total - system.body.pulled(q, jax.grad(system.potential)(q))
+        gradient = jax.grad(system.potential)(q)
+        total = total - system.body.pulled(q, gradient)
     return solve_mass_matrix(mass, total + system.body.inertial_force(q, v))

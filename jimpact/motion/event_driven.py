@@ -6,6 +6,7 @@ until as many lanes wait as fly, because resolving it costs as much in one lane 
 all.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -83,7 +84,8 @@ def empty_checkpoint(
 ) -> Float[Array, " size"]:
     """`Past.numbers` of a motion that begins: zeros, enough for a `_Checkpoint`."""
     state = q.shape[0] + v.shape[0] + 2 * contacts + 3
-    return jnp.asarray(np.zeros((samples + 2) * state + ROOM * (contacts + 2), q.dtype))
+    size = (samples + 2) * state + ROOM * (contacts + 2)
+    return jnp.asarray(np.zeros(size, q.dtype))
 
 
 def event_driven(
@@ -115,9 +117,8 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
         on = goes_on(problem, run)
         waiting = on & run.waits
         flying = on & ~run.waits
-        due = over_lanes(waiting.astype(jnp.int32)) >= over_lanes(
-            flying.astype(jnp.int32)
-        )
+        waiting_lanes = over_lanes(waiting.astype(jnp.int32))
+        due = waiting_lanes >= over_lanes(flying.astype(jnp.int32))
         run = _resolved(problem, max_events, run, waiting, due)
         return _flown(problem, run, goes_on(problem, run) & ~run.waits)
 
@@ -130,15 +131,15 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
         next_past = _pack_checkpoint(last, problem.past.numbers.shape[0])
     end = end_of(problem, last, last.smooth, next_past)
     reported = last.several & (end.status == CODE["ok"])
-    status = jnp.where(reported, CODE["several_outcomes"], end.status).astype(jnp.int32)
+    code = jnp.where(reported, CODE["several_outcomes"], end.status)
+    status = code.astype(jnp.int32)
     return end._replace(status=status)
 
 
 def _checkpoint(run: _EventRun) -> _Checkpoint:
     """The fields of a run that the next one goes on from."""
-    own = {
-        name: getattr(run, name) for name in _Checkpoint._fields if name != "samples"
-    }
+    names = (name for name in _Checkpoint._fields if name != "samples")
+    own = {name: getattr(run, name) for name in names}
     return _Checkpoint(**own, samples=run.table.samples)
 
 
@@ -146,11 +147,10 @@ def _pack_checkpoint(run: _EventRun, size: int) -> Float[Array, " size"]:
     """Numbers of `Past`: 1, the leaves of the checkpoint in turn, zeros up to
     `size`.
     """
-    parts = [
-        jnp.ravel(x).astype(run.allowed.dtype)
-        for x in jax.tree.leaves(_checkpoint(run))
-    ]
-    flat = jnp.concatenate([jnp.ones(1, run.allowed.dtype), *parts])
+    leaves = jax.tree.leaves(_checkpoint(run))
+    parts = [jnp.ravel(x).astype(run.allowed.dtype) for x in leaves]
+    one = jnp.ones(1, run.allowed.dtype)
+    flat = jnp.concatenate([one, *parts])
     return jnp.pad(flat, (0, size - flat.shape[0]))
 
 
@@ -163,9 +163,11 @@ def _unpack_checkpoint(start: _EventRun, past: Float[Array, " size"]) -> _EventR
     parts = jnp.split(past, ends)[1:-1]
     known = [x.reshape(like.shape).astype(like.dtype) for x, like in zip(parts, leaves)]
     on = past[0] > 0
-    own = choose(on, jax.tree.unflatten(tree, known), _checkpoint(start))._asdict()
+    past_checkpoint = jax.tree.unflatten(tree, known)
+    own = choose(on, past_checkpoint, _checkpoint(start))._asdict()
     table = start.table._replace(samples=own.pop("samples"))
-    status = jnp.where(on, CODE["ok"], start.status).astype(jnp.int32)
+    code = jnp.where(on, CODE["ok"], start.status)
+    status = code.astype(jnp.int32)
     return start._replace(**own, table=table, status=status)
 
 
@@ -181,13 +183,15 @@ def _begin(problem: MotionProblem, max_events: int) -> _EventRun:
         margins = 2 * m
     else:
         margins = m
-    flight = first_flight(system, state, encoded(no_modes(m, dtype)), margins, times)
+    rows = encoded(no_modes(m, dtype))
+    flight = first_flight(system, state, rows, margins, times)
     zero = jnp.zeros((), dtype)
     no = jnp.asarray(False)
     status = status_at_start(system, state, times[-1], settings.closed_below)
     if mu is not None:
         known = jnp.all(jnp.isfinite(mu))
-        status = jnp.where(known, status, CODE["not_finite"]).astype(jnp.int32)
+        code = jnp.where(known, status, CODE["not_finite"])
+        status = code.astype(jnp.int32)
     return _EventRun(
         flight=flight,
         struck=jnp.zeros(m, bool),
@@ -213,81 +217,85 @@ def _resolved(
     """Run after its event, resolved and recorded if it is `waiting` here and `due` in
     all lanes.
 
-    An event more than `max_events` is not resolved: the status says so.
+    Else the run is as it was.
     """
-    system, law, mu, settings, *_ = problem
-    flight = run.flight
-    old = run.flight.state
-
-    def now(
-        run: _EventRun,
-    ) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
-        """Run after the event, and the rows of the event in the table."""
-        modes = decoded(flight.aim.modes, old.q.dtype)
-        fired = flight.event & waiting
-        outcome = resolve(
-            system,
-            law,
-            mu,
-            settings,
-            old,
-            modes,
-            fired,
-            run.scales,
-            run.struck,
-            run.approach,
-        )
-        happened = outcome.kind != KIND_CODE["none"]
-        most = (
-            max_events
-            if problem.past is None
-            else jnp.minimum(problem.past.most, max_events)
-        )
-        full = (run.event_count >= most) & happened  # no row is left
-        status = jnp.where(full, CODE["max_events"], outcome.status).astype(jnp.int32)
-        written = waiting & happened & ~full
-        state = outcome.after.state
-        ready = flight._replace(
-            state=state,
-            aim=flight.aim._replace(modes=encoded(outcome.modes)),
-            event=jnp.zeros_like(flight.event),
-        )
-        new = run._replace(
-            flight=toward_sample(ready, problem.times, flight.free),
-            struck=run.struck | (outcome.contacts & outcome.strikes),
-            allowed=jax.lax.stop_gradient(allowed_errors(system, settings, state)),
-            waits=outcome.approach > 0,
-            approach=outcome.approach,
-            several=run.several | outcome.several,
-            scales=outcome.scales,
-            event_count=run.event_count + written.astype(jnp.int32),
-            status=status,
-        )
-        codes = jnp.stack([outcome.kind, outcome.code])
-        marks = jnp.concatenate(
-            [codes.astype(jnp.int32), outcome.contacts.astype(jnp.int32)]
-        )
-        numbers = event_numbers(old, outcome.after)
-        # an event without a row is not resolved
-        new = choose(full, run._replace(status=status), new)
-        return choose(waiting, new, run), numbers, marks
 
     def later(
         run: _EventRun,
     ) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
         """The run as it is, and rows of zeros."""
-        return (
-            run,
-            jnp.zeros_like(run.table.events[0]),
-            jnp.zeros_like(run.table.marks[0]),
-        )
+        no_numbers = jnp.zeros_like(run.table.events[0])
+        no_marks = jnp.zeros_like(run.table.marks[0])
+        return run, no_numbers, no_marks
 
     table = run.table
     # both branches return what they are given: the first row of each table is enough
-    light = run._replace(table=MotionTable(*(x[:1] for x in table)))
+    first_rows = MotionTable(*(x[:1] for x in table))
+    light = run._replace(table=first_rows)
+    now = partial(_after_event, problem, max_events, waiting)
     new, numbers, marks = jax.lax.cond(due, now, later, light)
     row = jnp.where(new.event_count > run.event_count, run.event_count, max_events)
     return new._replace(table=table.with_event(numbers, marks, row))
+
+
+def _after_event(
+    problem: MotionProblem,
+    max_events: int,
+    waiting: Bool[Array, ""],
+    run: _EventRun,
+) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
+    """Run after the event if it is `waiting` here, and the rows of the event in the
+    table.
+
+    An event more than `max_events` is not resolved: the status says so.
+    """
+    system, law, mu, settings, *_ = problem
+    flight = run.flight
+    old = flight.state
+    modes = decoded(flight.aim.modes, old.q.dtype)
+    fired = flight.event & waiting
+    outcome = resolve(
+        system,
+        law,
+        mu,
+        settings,
+        old,
+        modes,
+        fired,
+        run.scales,
+        run.struck,
+        run.approach,
+    )
+    happened = outcome.kind != KIND_CODE["none"]
+    most = jnp.asarray(max_events)
+    if problem.past is not None:
+        most = jnp.minimum(problem.past.most, max_events)
+    full = (run.event_count >= most) & happened  # no row is left
+    code = jnp.where(full, CODE["max_events"], outcome.status)
+    status = code.astype(jnp.int32)
+    written = waiting & happened & ~full
+    state = outcome.after.state
+    aim = flight.aim._replace(modes=encoded(outcome.modes))
+    no_event = jnp.zeros_like(flight.event)
+    ready = flight._replace(state=state, aim=aim, event=no_event)
+    new = run._replace(
+        flight=toward_sample(ready, problem.times, flight.free),
+        struck=run.struck | (outcome.contacts & outcome.strikes),
+        allowed=jax.lax.stop_gradient(allowed_errors(system, settings, state)),
+        waits=outcome.approach > 0,
+        approach=outcome.approach,
+        several=run.several | outcome.several,
+        scales=outcome.scales,
+        event_count=run.event_count + written.astype(jnp.int32),
+        status=status,
+    )
+    codes = jnp.stack([outcome.kind, outcome.code])
+    contacts = outcome.contacts.astype(jnp.int32)
+    marks = jnp.concatenate([codes.astype(jnp.int32), contacts])
+    numbers = event_numbers(old, outcome.after)
+    # an event without a row is not resolved
+    new = choose(full, run._replace(status=status), new)
+    return choose(waiting, new, run), numbers, marks
 
 
 def _flown(problem: MotionProblem, run: _EventRun, flies: Bool[Array, ""]) -> _EventRun:
@@ -304,11 +312,9 @@ def _flown(problem: MotionProblem, run: _EventRun, flies: Bool[Array, ""]) -> _E
     modes = decoded(begin.aim.modes, begin.state.q.dtype)
     flow = flow_of(system, mu, settings, modes, run.scales, times, begin.state)
     flight, _ = one_pass(flow, settings, run.allowed, times, begin, flies)
-    table = run.table.with_sample(flight.state, jnp.where(flies, begin.sample, last))
+    row = jnp.where(flies, begin.sample, last)
+    table = run.table.with_sample(flight.state, row)
     counts = jnp.stack([flight.sample, run.event_count])
-    return run._replace(
-        flight=flight,
-        waits=run.waits | (flies & jnp.any(flight.event)),
-        smooth=jnp.where(flight.jumped, run.smooth, counts),
-        table=table,
-    )
+    waits = run.waits | (flies & jnp.any(flight.event))
+    smooth = jnp.where(flight.jumped, run.smooth, counts)
+    return run._replace(flight=flight, waits=waits, smooth=smooth, table=table)

@@ -140,10 +140,9 @@ def readable_speed(duration: float) -> float:
     if not 0 < wanted < 1:
         return 1.0
     power = float(10.0 ** np.floor(np.log10(wanted) + 1e-9))
-    return (
-        float(max(x for x in (1.0, 2.0, 5.0) if x * power <= wanted * (1 + 1e-9)))
-        * power
-    )
+    below = wanted * (1 + 1e-9)
+    digit = max(x for x in (1.0, 2.0, 5.0) if x * power <= below)
+    return float(digit) * power
 
 
 def _frames(
@@ -154,7 +153,8 @@ def _frames(
     """
     course = course_of(motion)
     body = system.body
-    known = np.isfinite(course.q).all(axis=1) & np.isfinite(course.v).all(axis=1)
+    finite_q = np.isfinite(course.q).all(axis=1)
+    known = finite_q & np.isfinite(course.v).all(axis=1)
     at = course.time[known]
     q = course.q[known]
     v = course.v[known]
@@ -166,16 +166,17 @@ def _frames(
         speed = readable_speed(at[-1] - at[0])
     else:
         speed = float(speed)
-    count = int((at[-1] - at[0]) / speed * rate + 1e-9) + 1
+    duration = (at[-1] - at[0]) / speed
+    count = int(duration * rate + 1e-9) + 1
     time = at[0] + np.arange(count) * speed / rate
-    slopes = np.asarray(jax.vmap(body.rates)(jnp.asarray(q), jnp.asarray(v)))  # dq/dt
+    rates = jax.vmap(body.rates)
+    slopes = np.asarray(rates(jnp.asarray(q), jnp.asarray(v)))  # dq/dt
     q = positions(at, q, slopes, time)
     ground = np.zeros((count, 2))
     point = POINT * (np.ptp(q) or 1.0)
     if system.base is not None:
-        q = np.asarray(
-            jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time))
-        )
+        seen = jax.vmap(partial(seen_from_base, system))
+        q = np.asarray(seen(jnp.asarray(q), jnp.asarray(time)))
         ground = base_path(system, time)  # in the picture
         if ground.shape[1] == 3:
             ground = projected(ground)
@@ -185,13 +186,15 @@ def _frames(
         [curve + moved for curve in body.outlines(x, point)]
         for x, moved in zip(q, ground)
     ]
-    digits = max(2, int(np.ceil(-np.log10(speed / rate))))  # in which frames differ
+    digits_that_differ = int(np.ceil(-np.log10(speed / rate)))
+    digits = max(2, digits_that_differ)  # in which frames differ
     if speed == 1:
         slow = ""
     else:
         slow = f" (speed {speed:g})"
     captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
-    return count, _film(body, curves, colours_of(body, q[0], point), ground, captions)
+    colours = colours_of(body, q[0], point)
+    return count, _film(body, curves, colours, ground, captions)
 
 
 def _film(
@@ -239,7 +242,8 @@ def stretch_of(
     middle = view.mean(axis=1)
     reach = np.ptp(view[0])
     foot = middle - (n @ (middle - ground) - offset) * n
-    return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
+    direction = np.array([n[1], -n[0]])[:, None]
+    return foot[:, None] + reach * np.array([-1, 1]) * direction
 
 
 def positions(
@@ -264,10 +268,14 @@ def positions(
     """
     if len(at) == 1:
         return np.repeat(q, len(time), axis=0)
-    k = np.clip(np.searchsorted(at, time, side="right") - 1, 0, len(at) - 2)
+    before = np.searchsorted(at, time, side="right") - 1
+    k = np.clip(before, 0, len(at) - 2)
     h = (at[k + 1] - at[k])[:, None]
-    s = (time - at[k])[:, None] / np.where(h > 0, h, 1.0)
+    after = (time - at[k])[:, None]
+    s = after / np.where(h > 0, h, 1.0)
     begin = (1 + 2 * s) * (1 - s) ** 2
     end = s**2 * (3 - 2 * s)
-    turns = s * (1 - s) ** 2 * h * slopes[k] - s**2 * (1 - s) * h * slopes[k + 1]
+    of_begin = s * (1 - s) ** 2 * h * slopes[k]
+    of_end = s**2 * (1 - s) * h * slopes[k + 1]
+    turns = of_begin - of_end
     return begin * q[k] + end * q[k + 1] + turns

@@ -152,7 +152,8 @@ def contact_margins(
     w = jnp.diagonal(contacts.delassus)
     slack = rest_acceleration(w.dtype) * scales.acceleration
     gap = contacts.normal.value - below
-    normal = jnp.where(modes.active, force.normal * w[:m] + slack, gap)
+    push = force.normal * w[:m] + slack
+    normal = jnp.where(modes.active, push, gap)
     if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
     # sliding ends where slip does, and where its forces stop to exist: both may be in
@@ -185,7 +186,8 @@ def friction_margins(
     """
     cone = cone_margins(contacts, mu, force) + slack
     ends = slip_margins(contacts, mu, modes, force, lasts, speed_scale)
-    return jnp.where(modes.active, jnp.where(modes.stick, cone, ends), 1.0)
+    held = jnp.where(modes.stick, cone, ends)
+    return jnp.where(modes.active, held, 1.0)
 
 
 class MotionFlow(eqx.Module, stepper.Flow):
@@ -246,7 +248,8 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """Rows of margins, that of the next sample `t_sample - t` last, over their
         rounding.
         """
-        return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
+        time_left = self.sample - at.t
+        return (jnp.append(margins, time_left) / self.rounding)[:, None]
 
     def errors_of_error_only_rows(
         self,
@@ -274,7 +277,8 @@ class MotionFlow(eqx.Module, stepper.Flow):
             along = None
         else:
             along = self.axes.along
-        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None, along)
+        rubs = self.mu is not None
+        return contacts_at(self.system, at.q, at.v, at.t, rubs, along)
 
     def slip(self, modes: Modes, contacts: Contacts) -> Float[Array, "m 2"] | None:
         """Directions of slip in space, in the axes of the step; None in the plane."""
@@ -290,7 +294,8 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """
         rows = [self.regular(rates, at)]
         if self.axes is not None:
-            rows.append(log_rates(self.axes, modes, contacts, force)[:, None])
+            growth = log_rates(self.axes, modes, contacts, force)
+            rows.append(growth[:, None])
         return rows
 
     def projected(self, const: Any, at: State) -> tuple[State, Bool[Array, " jumps"]]:
@@ -320,9 +325,8 @@ class MotionFlow(eqx.Module, stepper.Flow):
     def regular(self, rates: State, at: State) -> Float[Array, "rows 1"]:
         """Rates (rows, 1) of the state; NaN where M is not positive definite."""
         if callable(self.system.mass):
-            return jnp.where(
-                definite(mass_at(self.system, at.q)), packed(rates), jnp.nan
-            )
+            positive = definite(mass_at(self.system, at.q))
+            return jnp.where(positive, packed(rates), jnp.nan)
         return packed(rates)
 
 
@@ -371,11 +375,8 @@ class MechanicalFlow(MotionFlow):
         else:
             of_u = h * jnp.abs(state.v)
         normal, _ = kinematics(self.system, state.q, state.v, state.t)
-        of_gap = (
-            jnp.abs(normal.value)
-            + h * jnp.abs(normal.rate)
-            + jnp.abs(normal.gradient).T @ of_u
-        )
+        of_rate = jnp.abs(normal.value) + h * jnp.abs(normal.rate)
+        of_gap = of_rate + jnp.abs(normal.gradient).T @ of_u
         errors = settings.atol + settings.rtol * of_gap
         return [errors, *super().errors_of_error_only_rows(settings, state, h, of_q)]
 
@@ -394,9 +395,11 @@ class MechanicalFlow(MotionFlow):
         """
         at = unpacked(self.like, y)
         contacts = self.contacts(at)
-        force = forces(contacts, self.mu, const, self.slip(const, contacts))
+        slip = self.slip(const, contacts)
+        force = forces(contacts, self.mu, const, slip)
         friction, base = contact_powers(self.system, contacts, force, at.t)
-        power = user_force(self.system, at.q, at.v, at.t) @ at.v
+        push = user_force(self.system, at.q, at.v, at.t)
+        power = push @ at.v
         rates = State(
             q=self.system.body.rates(at.q, at.v),
             v=force.acceleration,
@@ -406,7 +409,8 @@ class MechanicalFlow(MotionFlow):
             contact_work=jnp.stack([jnp.zeros_like(friction), friction]),
             contact=jnp.zeros_like(at.contact),
         )
-        gaps_by_steps = jnp.where(const.active, 0.0, contacts.normal.rate)[:, None]
+        by_steps = jnp.where(const.active, 0.0, contacts.normal.rate)
+        gaps_by_steps = by_steps[:, None]
         rows, *logs = self.rows_of(rates, at, const, contacts, force)
         return jnp.concatenate([rows, gaps_by_steps, *logs])
 
@@ -438,20 +442,21 @@ class MechanicalFlow(MotionFlow):
         # a motion that began at rest had no speed before this step
         energy = kinetic(self.system, at.q, at.v)
         w = jnp.diagonal(contacts.delassus)
-        speed = jnp.maximum(self.scales.speed, speed_of(energy, w[: len(rate)]))
+        by_energy = speed_of(energy, w[: len(rate)])
+        speed = jnp.maximum(self.scales.speed, by_energy)
         jumps = const.active & (jnp.abs(rate) > most * speed)
         if contacts.tangent is not None:  # tangentially only velocities drift
-            value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
+            zero = jnp.zeros_like(contacts.tangent.rate)
+            value = jnp.concatenate([value, zero])
             rate = jnp.concatenate([rate, contacts.tangent.rate])
             if self.axes is not None:
                 const = straightened(self.axes, const, contacts.tangent.rate)
-        p = constraint_impulse(
-            contacts, self.mu, const, jnp.stack([value, rate], axis=1)
-        )
+        both = jnp.stack([value, rate], axis=1)
+        p = constraint_impulse(contacts, self.mu, const, both)
         move = contacts.moved @ p
-        back = at._replace(
-            q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1]
-        )
+        of_gaps, of_rates = move.T
+        q = self.system.body.moved(at.q, of_gaps)
+        back = at._replace(q=q, v=at.v + of_rates)
         return choose(jnp.any(jumps), at, back), jumps
 
 
@@ -475,7 +480,8 @@ def decoded(rows: Int[Array, "k 1"], dtype: Any) -> Modes:
 def encoded(modes: Modes) -> Int[Array, "k 1"]:
     """Modes as rows (3 m, 1) of whole numbers: `active`, `stick`, `sign`."""
     rows = [modes.active, modes.stick, modes.sign]
-    return jnp.concatenate([x.astype(jnp.int32) for x in rows])[:, None]
+    whole = [x.astype(jnp.int32) for x in rows]
+    return jnp.concatenate(whole)[:, None]
 
 
 class Flight(NamedTuple):
@@ -516,11 +522,11 @@ def first_flight(
 
     `rows` of the modes; `events`: number of margins whose zeros are events.
     """
-    step = jnp.minimum(
-        jax.lax.stop_gradient(targets[1] - targets[0]), longest_step(system, targets)
-    )
+    between = jax.lax.stop_gradient(targets[1] - targets[0])
+    step = jnp.minimum(between, longest_step(system, targets))
     # `stepper.Step.clock`: a step in time from 0 of this length, to no target
-    clock = jnp.stack([0 * step, step, 0 * step, 0 * step])[:, None]
+    no = 0 * step
+    clock = jnp.stack([no, step, no, no])[:, None]
     return Flight(
         state=state,
         aim=stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock),
@@ -549,9 +555,13 @@ def toward_sample(
     lands = left <= h
     # the last margin is the time left; `clock` and `plan`: see `stepper.Step`,
     # `StepperState`
-    target = jnp.zeros_like(flight.aim.target).at[-1].set(lands)
-    clock = jnp.stack([0 * h, h, 0 * h, lands.astype(h.dtype)])[:, None]
-    plan = flight.plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
+    no_target = jnp.zeros_like(flight.aim.target)
+    target = no_target.at[-1].set(lands)
+    no = 0 * h
+    landing = lands.astype(h.dtype)
+    clock = jnp.stack([no, h, no, landing])[:, None]
+    ahead = jnp.where(lands, left, h)
+    plan = flight.plan.at[0, 0].set(ahead).at[1].set(0.0)
     aim = flight.aim._replace(target=target, clock=clock)
     aim, plan = jax.lax.stop_gradient((aim, plan))
     return flight._replace(aim=aim, plan=plan)
@@ -580,9 +590,8 @@ def one_pass(
         )[:, None],
     )
     # passes are counted here: their number does not lower the tolerance
-    carry = stepper.StepperState(
-        _rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0)
-    )
+    no_passes = flight.plan.at[2:].set(0.0)
+    carry = stepper.StepperState(_rows(flow, state), flight.aim, no_passes)
     after, accept = stepper.advance(flow, carry, 2)
     accept = accept[0, 0] & flies
     landed = flight.aim.target[:, 0] & accept  # margins that the step has brought to 0
@@ -591,18 +600,20 @@ def one_pass(
     state = choose(accept, new, state)
     jumps = jumps & accept
     event = landed[:-1].at[: len(jumps)].max(jumps)  # another normal is an event, too
-    steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
+    counted = jnp.asarray(flies).astype(flight.steps.dtype)
+    steps = flight.steps + counted
     shrinks = after.step.length[0, 0] < _smallest_step(targets)
     # a landing on what is left within rounding is as short, and ends
-    vanishes = flies & ~accept & shrinks & (after.step.lands[0, 0] == 0)
+    lands_not = after.step.lands[0, 0] == 0
+    vanishes = flies & ~accept & shrinks & lands_not
     # what an event or a sample shortens says nothing of the steps after it
     tried = flight.aim.length[0, 0]
     lands = flight.aim.lands[0, 0] > 0
     proposed = after.step.length[0, 0]
-    longer = jnp.where(
-        tried < flight.free, jnp.maximum(proposed, FORGET * flight.free), proposed
-    )
-    free = jnp.where(accept & ~lands, jax.lax.stop_gradient(longer), flight.free)
+    remembered = jnp.maximum(proposed, FORGET * flight.free)
+    longer = jnp.where(tried < flight.free, remembered, proposed)
+    free_step = jax.lax.stop_gradient(longer)
+    free = jnp.where(accept & ~lands, free_step, flight.free)
     moved = flight._replace(
         state=state,
         free=free,
@@ -619,7 +630,7 @@ def one_pass(
     )
     begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
     aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
-    in_time = (after.step.in_root[0, 0] == 0) & (after.step.lands[0, 0] == 0)
+    in_time = (after.step.in_root[0, 0] == 0) & lands_not
     # the stepper keeps its plan for a landing, a step in the root of time, and a
     # rejected one
     plain = sampled | (accept & in_time)
@@ -631,7 +642,8 @@ def out_of_range(system: System, at: State) -> Bool[Array, ""]:
     """True where q is outside the range in which the gap function of the body holds."""
     if type(system.body).valid is Body.valid:
         return jnp.asarray(False)
-    return ~(system.body.valid(seen_from_base(system, at.q, at.t)) >= 0)
+    seen = seen_from_base(system, at.q, at.t)
+    return ~(system.body.valid(seen) >= 0)
 
 
 def status_at_start(
@@ -641,19 +653,22 @@ def status_at_start(
     [s].
     """
     allowed = jnp.maximum(closed_below, system.body.overlap)
-    penetrates = jnp.any(recorded_gaps(system, at.q, at.t) < -allowed)
+    gap = recorded_gaps(system, at.q, at.t)
+    penetrates = jnp.any(gap < -allowed)
     status = jnp.where(penetrates, CODE["penetration"], CODE["ok"])
     status = jnp.where(out_of_range(system, at), CODE["out_of_range"], status)
     status = jnp.where(end <= at.t, CODE["backward"], status)
-    finite = (
-        jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
-    )
-    return jnp.where(finite, status, CODE["not_finite"]).astype(jnp.int32)
+    finite_q = jnp.all(jnp.isfinite(at.q))
+    finite_v = jnp.all(jnp.isfinite(at.v))
+    finite = finite_q & finite_v & jnp.isfinite(end)
+    code = jnp.where(finite, status, CODE["not_finite"])
+    return code.astype(jnp.int32)
 
 
 def _rows(flow: MotionFlow, state: State) -> Float[Array, "rows 1"]:
     """Rows of the state, then `error_only_rows`, which begin at 0."""
-    return jnp.pad(packed(state), ((0, flow.error_only_rows), (0, 0)))
+    more = (0, flow.error_only_rows)
+    return jnp.pad(packed(state), (more, (0, 0)))
 
 
 def _reached(
@@ -664,8 +679,10 @@ def _reached(
 
     On a sample t is that of the sample to the last digit.
     """
-    new, jumps = flow.projected(flow.constants(aim.modes), unpacked(flow.like, y))
-    return new._replace(t=jnp.where(aim.target[-1, 0], flow.sample, new.t)), jumps
+    const = flow.constants(aim.modes)
+    new, jumps = flow.projected(const, unpacked(flow.like, y))
+    t = jnp.where(aim.target[-1, 0], flow.sample, new.t)
+    return new._replace(t=t), jumps
 
 
 def _errors(
@@ -684,20 +701,21 @@ def _errors(
     state = flight.state
     h = flight.plan[0, 0]
     push = user_force(system, state.q, state.v, state.t)
-    rates = free_acceleration(system, state.q, state.v, push, mass_at(system, state.q))
-    of_q = jnp.abs(state.q) + h * jnp.abs(system.body.rates(state.q, state.v))
+    mass = mass_at(system, state.q)
+    rates = free_acceleration(system, state.q, state.v, push, mass)
+    q_rates = jnp.abs(system.body.rates(state.q, state.v))
+    of_q = jnp.abs(state.q) + h * q_rates
     of_v = jnp.abs(state.v) + h * jnp.abs(rates)
-    errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
-    return jnp.concatenate(
-        [*errors, *flow.errors_of_error_only_rows(settings, state, h, of_q)]
-    )
+    sizes = jnp.concatenate([of_q, of_v])
+    errors = [settings.atol + settings.rtol * sizes, allowed]
+    others = flow.errors_of_error_only_rows(settings, state, h, of_q)
+    return jnp.concatenate([*errors, *others])
 
 
 def _smallest_step(targets: Float[Array, " S"]) -> Float[Array, ""]:
     """Length [s] below which a step does not move time any more."""
-    return not_rounding(SMALLEST_STEP, targets.dtype) * (
-        jnp.abs(targets[0]) + jnp.abs(targets[-1])
-    )
+    latest = jnp.abs(targets[0]) + jnp.abs(targets[-1])
+    return not_rounding(SMALLEST_STEP, targets.dtype) * latest
 
 
 def allowed_errors(
@@ -710,20 +728,22 @@ def allowed_errors(
     integrated exactly.
     """
     mass = mass_at(system, at.q)
-    free = free_acceleration(
-        system, at.q, at.v, user_force(system, at.q, at.v, at.t), mass
-    )
+    push = user_force(system, at.q, at.v, at.t)
+    free = free_acceleration(system, at.q, at.v, push, mass)
     both = jnp.stack([free, at.v], axis=1)
     # |M v'|, |M v|
     pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
     of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
     if system.body.coordinates is not None:  # of displacements
         of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
-    ledger = share * (of_q @ pushed[:, 0] + of_v @ pushed[:, 1])
-    rows = packed(at).shape[0] - at.q.shape[0] - at.v.shape[0]
+    by_forces, by_velocity = pushed.T
+    ledger = share * (of_q @ by_forces + of_v @ by_velocity)
+    q_and_v = at.q.shape[0] + at.v.shape[0]
+    rows = packed(at).shape[0] - q_and_v
     # positive even without motion or forces
     # time: none
-    return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)
+    least = jnp.maximum(ledger, settings.atol)
+    return jnp.full(rows, least).at[0].set(jnp.inf)
 
 
 def roundings(
@@ -763,7 +783,8 @@ def flow_of(
     blank = jnp.zeros((1, 1), state.q.dtype)
     # where contacts that were held not quite closed are closed, redundant ones come to
     # lie below
-    below = jax.lax.stop_gradient(jnp.minimum(gaps(system, state.q, state.t), 0.0))
+    gap = gaps(system, state.q, state.t)
+    below = jax.lax.stop_gradient(jnp.minimum(gap, 0.0))
     axes = None
     if mu is not None and settings.spatial:
         contacts = contacts_at(system, state.q, state.v, state.t, True)

@@ -244,7 +244,8 @@ def as_method(
 
 def name_of(method: Method) -> str:
     """The word for a method."""
-    return next(name for name, kind in METHODS.items() if isinstance(method, kind))
+    named = METHODS.items()
+    return next(name for name, kind in named if isinstance(method, kind))
 
 
 def substeps_of(
@@ -254,7 +255,8 @@ def substeps_of(
     if is_traced((start, end)):
         raise ValueError("Argument `t_end` must not be traced in time stepping.")
     between = (float(end) - float(start)) / (samples - 1)
-    count = max(1.0, np.ceil(between / float(method.step) * (1 - 1e-9)))
+    steps = between / float(method.step)
+    count = max(1.0, np.ceil(steps * (1 - 1e-9)))
     if count * (samples - 1) > MOST_STEPS:
         raise ValueError(
             f"Argument `step` must give at most {MOST_STEPS} steps, but has value "

@@ -109,7 +109,8 @@ class Forces(NamedTuple):
 
 def no_modes(m: int, dtype: jnp.dtype) -> Modes:
     """Modes of m open contacts."""
-    return Modes(jnp.zeros(m, bool), jnp.zeros(m, bool), jnp.zeros(m, dtype))
+    none = jnp.zeros(m, bool)
+    return Modes(none, none, jnp.zeros(m, dtype))
 
 
 def by_contact(rows: Float[Array, " t"], m: int) -> Float[Array, "m r"]:
@@ -122,7 +123,8 @@ def length(rows: Float[Array, "m r"]) -> Float[Array, " m"]:
     if rows.shape[1] == 1:
         return jnp.abs(rows[:, 0])
     square = jnp.sum(rows**2, axis=1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    positive = jnp.where(square > 0, square, 1.0)
+    return jnp.where(square > 0, jnp.sqrt(positive), 0.0)
 
 
 def direction(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
@@ -136,7 +138,8 @@ def direction(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
 def in_space(contacts: Contacts) -> bool:
     """True where each contact has two tangents."""
     tangent = contacts.tangent
-    return tangent is not None and len(tangent.rate) == 2 * len(contacts.normal.rate)
+    contact_count = len(contacts.normal.rate)
+    return tangent is not None and len(tangent.rate) == 2 * contact_count
 
 
 def held_rows(modes: Modes, size: int) -> Bool[Array, " size"]:
@@ -154,9 +157,8 @@ def held_rows(modes: Modes, size: int) -> Bool[Array, " size"]:
     if size == 2 * m:
         return jnp.concatenate([modes.active, stick])
     across = stick | (modes.active & (modes.sign == BEGINS))
-    return jnp.concatenate(
-        [modes.active, jnp.stack([stick, across], axis=1).reshape(-1)]
-    )
+    tangential = jnp.stack([stick, across], axis=1)
+    return jnp.concatenate([modes.active, tangential.reshape(-1)])
 
 
 def contacts_at(
@@ -183,16 +185,11 @@ def contacts_at(
         directions = jnp.concatenate([directions, tangent.gradient], axis=1)
         drift = jnp.concatenate([drift, tangent.drift])
     moved = solve_mass_matrix(mass, directions)
-    free = free_acceleration(system, q, v, user_force(system, q, v, t), mass)
-    return Contacts(
-        normal,
-        tangent,
-        directions,
-        moved,
-        directions.T @ moved,
-        free,
-        directions.T @ free + drift,
-    )
+    push = user_force(system, q, v, t)
+    free = free_acceleration(system, q, v, push, mass)
+    delassus = directions.T @ moved
+    approach = directions.T @ free + drift
+    return Contacts(normal, tangent, directions, moved, delassus, free, approach)
 
 
 def with_normal_forces(contacts: Contacts, push: Float[Array, " m"]) -> Contacts:
@@ -203,19 +200,21 @@ def with_normal_forces(contacts: Contacts, push: Float[Array, " m"]) -> Contacts
     """
     m = len(push)
     size = jnp.diagonal(contacts.delassus)[:m]
-    w = contacts.delassus.at[:, :m].set(0.0).at[:m].set(0.0)
+    without_columns = contacts.delassus.at[:, :m].set(0.0)
+    w = without_columns.at[:m].set(0.0)
     pushed = contacts.approach + contacts.delassus[:, :m] @ push
-    return contacts._replace(
-        delassus=w.at[:m, :m].set(jnp.diag(size)),
-        approach=pushed.at[:m].set(-size * push),
-    )
+    delassus = w.at[:m, :m].set(jnp.diag(size))
+    approach = pushed.at[:m].set(-size * push)
+    return contacts._replace(delassus=delassus, approach=approach)
 
 
 def slip_frames(along: Float[Array, "m 2"]) -> Float[Array, "m 2 2"]:
     """Axes (m, axis, component) in each plane of contact: `along`, and at right angles
     to it.
     """
-    return jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
+    x, y = along.T
+    across = jnp.stack([-y, x], axis=1)
+    return jnp.stack([along, across], axis=1)
 
 
 def _turned(tangent: Kinematics, along: Float[Array, "m 2"]) -> Kinematics:
@@ -241,7 +240,8 @@ def friction_acceleration(
     `normal` are forces lambda_n [N]; W_tt is the mean over the tangents of the contact.
     """
     m = len(mu)
-    return mu * normal * by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
+    w = jnp.diagonal(contacts.delassus)[m:]
+    return mu * normal * by_contact(w, m).mean(axis=1)
 
 
 def cone_margins(
@@ -252,8 +252,10 @@ def cone_margins(
     """
     assert force.tangential is not None
     m = len(mu)
-    sizes = by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
-    return (mu * force.normal - length(by_contact(force.tangential, m))) * sizes
+    w = jnp.diagonal(contacts.delassus)[m:]
+    sizes = by_contact(w, m).mean(axis=1)
+    drag = length(by_contact(force.tangential, m))
+    return (mu * force.normal - drag) * sizes
 
 
 def slip_begins(
@@ -285,9 +287,8 @@ def forces(
     """
     m = contacts.normal.value.shape[0]
     if contacts.tangent is None or mu is None:
-        normal = _without_friction(
-            contacts.delassus, -contacts.approach[:, None], modes.active
-        )[:, 0]
+        approach = contacts.approach[:, None]
+        normal = _without_friction(contacts.delassus, -approach, modes.active)[:, 0]
         return Forces(normal, None, contacts.free + contacts.moved @ normal)
     w, held, drag = _dragged(contacts, mu, modes, slip)
     right = -contacts.approach
@@ -299,16 +300,18 @@ def forces(
         """
         # redundant sticking contacts share what they hold in proportion to mu lambda_n,
         # as in `numerics/friction.py`: they break loose together
-        press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
+        last_push = jax.lax.stop_gradient(known[:m])
+        press = mu * jnp.maximum(last_push, 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
         weight = jnp.concatenate([none + 1, share])
-        return _least(w, right[:, None], held, weight, _sizes(w, contacts.delassus, m))[
-            :, 0
-        ]
+        sizes = _sizes(w, contacts.delassus, m)
+        return _least(w, right[:, None], held, weight, sizes)[:, 0]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
-    both = both.at[m:].add(-(drag * both[:m, None]).reshape(-1))
-    return Forces(both[:m], both[m:], contacts.free + contacts.moved @ both)
+    side = -(drag * both[:m, None]).reshape(-1)
+    both = both.at[m:].add(side)
+    acceleration = contacts.free + contacts.moved @ both
+    return Forces(both[:m], both[m:], acceleration)
 
 
 def _dragged(
@@ -332,12 +335,10 @@ def _dragged(
     else:
         along = slip
     drag = jnp.where(slides, along * mu[:, None], 0.0)
-    pull = (
-        (contacts.delassus[:, m:] * drag.reshape(-1)[None])
-        .reshape(k, m, -1)
-        .sum(axis=2)
-    )
-    return contacts.delassus.at[:, :m].add(-pull), held_rows(modes, k), drag
+    dragged = contacts.delassus[:, m:] * drag.reshape(-1)[None]
+    pull = dragged.reshape(k, m, -1).sum(axis=2)
+    w = contacts.delassus.at[:, :m].add(-pull)
+    return w, held_rows(modes, k), drag
 
 
 def regularity(
@@ -354,13 +355,17 @@ def regularity(
     at them; below the root of rounding it counts as 0.
     """
     w, held, _ = _dragged(contacts, mu, modes, slip)
-    scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(contacts.delassus), 1.0))
-    scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
+    size = jnp.where(held, jnp.diagonal(contacts.delassus), 1.0)
+    scale = 1 / jnp.sqrt(size)
+    finite = jnp.where(scale < jnp.inf, scale, 1.0)
+    scale = jax.lax.stop_gradient(finite)
     both = (held[:, None] & held[None, :])[None]
-    k = jnp.stack([w, contacts.delassus]) * jnp.outer(scale, scale)[None]
+    both_matrices = jnp.stack([w, contacts.delassus])
+    k = both_matrices * jnp.outer(scale, scale)[None]
     eye = jnp.eye(len(held), dtype=w.dtype)[None]
     ridge = precision(w.dtype).eps ** _FAINT_RIDGE
-    with_friction, without = determinants(jnp.where(both, k, eye) + ridge * eye)
+    regular = jnp.where(both, k, eye) + ridge * eye
+    with_friction, without = determinants(regular)
     return with_friction / without
 
 
@@ -383,7 +388,8 @@ def _sizes(
     # both rows of slip of a contact alike: else its share would depend on how they are
     # turned
     rows = by_contact(sizes[m:], m)
-    return jnp.concatenate([sizes[:m], jnp.repeat(rows.mean(axis=1), rows.shape[1])])
+    by_mean = jnp.repeat(rows.mean(axis=1), rows.shape[1])
+    return jnp.concatenate([sizes[:m], by_mean])
 
 
 def _without_friction(
@@ -395,11 +401,12 @@ def _without_friction(
     others by `_least`.
     """
     if len(held) > _INDEPENDENT:
-        return _least(
-            w, right, held, jnp.ones_like(right[:, 0]), jnp.diagonal(w), _THIN_RIDGE
-        )
-    k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(len(held), dtype=w.dtype))
-    return solve_definite(k, jnp.where(held[:, None], right, 0.0))
+        one = jnp.ones_like(right[:, 0])
+        return _least(w, right, held, one, jnp.diagonal(w), _THIN_RIDGE)
+    both = held[:, None] & held[None, :]
+    k = jnp.where(both, w, jnp.eye(len(held), dtype=w.dtype))
+    of_held = jnp.where(held[:, None], right, 0.0)
+    return solve_definite(k, of_held)
 
 
 def _least(
@@ -418,11 +425,14 @@ def _least(
     slip.
     """
     scale = jnp.where(held, 1 / jnp.sqrt(size), 1.0)
-    scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
+    finite = jnp.where(scale < jnp.inf, scale, 1.0)
+    scale = jax.lax.stop_gradient(finite)
     both = held[:, None] & held[None, :]
     scaled = w * scale[:, None] * (scale * weight)[None]
-    k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
-    right = jnp.where(held[:, None], right * scale[:, None], 0.0)
+    eye = jnp.eye(len(held), dtype=w.dtype)
+    k = jnp.where(both, scaled, eye)
+    scaled_right = right * scale[:, None]
+    right = jnp.where(held[:, None], scaled_right, 0.0)
     ridges = jnp.where(held, ridge, 0.0)[:, None]
     z = regularized(k, right, ridges, _REFINEMENTS, without_null=True)
     return (scale * weight)[:, None] * z
@@ -445,11 +455,13 @@ def constraint_impulse(
     w = contacts.delassus[:size, :size]
     columns = rates.reshape(size, -1)
     if friction:
-        p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]), jnp.diagonal(w))
+        one = jnp.ones_like(columns[:, 0])
+        p = _least(w, -columns, held, one, jnp.diagonal(w))
     else:
         p = _without_friction(w, -columns, held)
     rest = contacts.delassus.shape[0] - size
-    return jnp.pad(p.reshape(rates.shape), ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
+    padding = ((0, rest),) + ((0, 0),) * (rates.ndim - 1)
+    return jnp.pad(p.reshape(rates.shape), padding)
 
 
 def contact_powers(
@@ -496,26 +508,24 @@ def slip_margins(
     slip = by_contact(contacts.tangent.rate, m)[:, 0]
     if not in_space(contacts):
         slip = modes.sign * slip
-    ends = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
+    duration = jnp.where(slip < 0, jnp.abs(lasts), lasts)
+    ends = slip * duration
     if not in_space(contacts):
         return ends
     both = jnp.concatenate([force.normal, force.tangential])
-    growth = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)[:, 0]
+    acceleration = contacts.approach + contacts.delassus @ both
+    growth = by_contact(acceleration[m:], m)[:, 0]
     by_friction = friction_acceleration(contacts, mu, force.normal)
     some = speed_scale > 0
-    falls = by_friction * slip / jnp.where(some, speed_scale, 1.0) + jnp.maximum(
-        growth, 0.0
-    )
-    across = by_contact(force.tangential, m)[:, 1] / jnp.where(
-        force.normal > 0, force.normal, 1.0
-    )
-    aside = by_friction - jnp.abs(across) * by_friction / (
-        _LEANING * jnp.where(mu > 0, mu, 1.0)
-    )
+    relative = by_friction * slip / jnp.where(some, speed_scale, 1.0)
+    falls = relative + jnp.maximum(growth, 0.0)
+    push = jnp.where(force.normal > 0, force.normal, 1.0)
+    across = by_contact(force.tangential, m)[:, 1] / push
+    leaning = _LEANING * jnp.where(mu > 0, mu, 1.0)
+    aside = by_friction - jnp.abs(across) * by_friction / leaning
     faster = slip_begins(contacts, mu, force.normal, growth)
-    return jnp.where(
-        modes.sign == BEGINS, jnp.minimum(jnp.minimum(falls, faster), aside), ends
-    )
+    begins = jnp.minimum(jnp.minimum(falls, faster), aside)
+    return jnp.where(modes.sign == BEGINS, begins, ends)
 
 
 class ModeChoice(NamedTuple):
@@ -565,12 +575,14 @@ def choose_with_friction(
     """
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
-    slip_began = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
+    slid = before.active & ~before.stick
+    slip_began = jnp.any(slid & (before.sign == BEGINS))
     problem = _ModeProblem(contacts, mu, touching, released, sliding, slip_began, slack)
     expected, directions = _expected_modes(problem, before)
     no = jnp.asarray(False)
     one = jnp.ones_like(slack)
-    start = _ModeTrial(expected, directions, touching, one, no, no, no, jnp.asarray(0))
+    passes = jnp.asarray(0)
+    start = _ModeTrial(expected, directions, touching, one, no, no, no, passes)
     end = jax.lax.while_loop(
         lambda trial: ~trial.done & (trial.passes < _PASSES),
         lambda trial: _next_trial(problem, trial),
@@ -639,14 +651,16 @@ def _expected_modes(
     ended = jnp.any(released[m:] & slid)  # slip of a contact has come to 0
     # where sticking breaks at one contact of a body, those that began to slide before
     # go on
-    goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
+    one_broke = jnp.any(released[m:] & before.stick)
+    goes_on = slid & one_broke & ~ended & ~sliding
     # in space directions are not remembered
     if spatial:
         starts = broken | goes_on
     else:
         starts = broken
     stick = ~sliding & (starts | ~goes_on)
-    now = Modes(touching, stick, jnp.where(goes_on, before.sign, 0.0))
+    sign = jnp.where(goes_on, before.sign, 0.0)
+    now = Modes(touching, stick, sign)
     moves = direction(by_contact(contacts.tangent.rate, m))
     slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
     # sliding begins against the last force of sticking
@@ -662,12 +676,8 @@ def _expected_modes(
     else:
         against = jnp.where(against > 0, -1.0, 1.0)
     if spatial:  # redundant contacts that share equally break loose together
-        at_rim = (
-            before.active
-            & before.stick
-            & ~sliding
-            & (cone_margins(contacts, mu, stuck) <= slack)
-        )
+        rim = cone_margins(contacts, mu, stuck) <= slack
+        at_rim = before.active & before.stick & ~sliding & rim
         starts = starts | (at_rim & jnp.any(broken))
     return now, jnp.where(starts[:, None], against, slides)
 
@@ -687,9 +697,11 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
     diagonal = jnp.diagonal(contacts.delassus)[:m]
     # rows of contacts that take part: normals (m), then their tangents; others get
     # lambda = 0
-    rows = jnp.concatenate([last.may_press, jnp.repeat(last.may_press, known.shape[1])])
+    tangents = jnp.repeat(last.may_press, known.shape[1])
+    rows = jnp.concatenate([last.may_press, tangents])
     eye = jnp.eye(len(rows), dtype=dtype)
-    w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
+    both = rows[:, None] & rows[None]
+    w = jnp.where(both, contacts.delassus, eye)
     free = jnp.where(rows, contacts.approach, 0.0)
     solution = solve(
         w,
@@ -699,25 +711,27 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
         complementary=True,
         sliding=known.reshape(-1),
     )
-    acceleration = contacts.approach + contacts.delassus @ jnp.concatenate(
-        [solution.normal, solution.tangential]
-    )
+    every_force = jnp.concatenate([solution.normal, solution.tangential])
+    acceleration = contacts.approach + contacts.delassus @ every_force
     # (m, r) of the slip
     along = by_contact(acceleration[m:], m)
     is_known = length(known) > 0
     active = last.may_press & (acceleration[:m] <= slack)
     # what has just let go needs a force, as an acceleration, that is no rounding
-    active = active & (~released[:m] | (solution.normal * diagonal > slack))
+    has_force = solution.normal * diagonal > slack
+    active = active & (~released[:m] | has_force)
     slips = is_known | (length(along) > slack)
     slide = jnp.where(is_known[:, None], known, direction(along))
     sign = slide[:, 0]
     if in_space(contacts):
         growth = jnp.sum(along * slide, axis=1)
         slow = slip_begins(contacts, mu, solution.normal, growth) > 0
-        sign = jnp.where(slow & ~sliding & ~slip_began, float(BEGINS), 1.0)
+        from_rest = slow & ~sliding & ~slip_began
+        sign = jnp.where(from_rest, float(BEGINS), 1.0)
     modes = Modes(active, active & ~slips, sign)
     # what was taken to slide from rest must do so
-    returns = active & is_known & ~sliding & (jnp.sum(known * along, axis=1) < -slack)
+    backwards = jnp.sum(known * along, axis=1) < -slack
+    returns = active & is_known & ~sliding & backwards
     several = solution.status == CODE["several_outcomes"]
     solved = solution.status <= CODE["several_outcomes"]
     free_again = jnp.where(solved, returns, ~sliding)[:, None]
@@ -728,7 +742,8 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
     # flights end where the regularity falls to `root`: contacts are wedged from twice
     # that on
     wedged = active & slips & (regular <= 2 * precision(dtype).root)
-    open_ones_part = jnp.all(~touching | last.may_press | (acceleration[:m] >= -slack))
+    moves_apart = acceleration[:m] >= -slack
+    open_ones_part = jnp.all(~touching | last.may_press | moves_apart)
     return _ModeTrial(
         modes=modes,
         known=jnp.where(free_again, 0.0, known),
@@ -764,6 +779,8 @@ def pressed_together(
     both = touching[:, None] & touching[None, :]
     eye = jnp.eye(m, dtype=w.dtype)
     # redundant contacts: any of the solutions will do
-    solution = solve_lcp(jnp.where(both, w, eye), b, regular=True)
+    matrix = jnp.where(both, w, eye)
+    solution = solve_lcp(matrix, b, regular=True)
     pressed = touching & (solution.z * jnp.diagonal(w) > slack)
-    return Pressed(pressed, touching & ~pressed & (solution.w <= slack), solution.z)
+    stays = touching & ~pressed & (solution.w <= slack)
+    return Pressed(pressed, stays, solution.z)

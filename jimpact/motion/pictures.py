@@ -99,18 +99,19 @@ def motion(
     rows = max(map(len, columns)) + 1
     # left coordinates, right velocities, a row for each unit; in the last row gaps and
     # energy
-    figure, panels = new_figure(
-        2.7 * rows + 0.4, title, rows, 2, sharex=True, squeeze=False
-    )
+    height = 2.7 * rows + 0.4
+    figure, panels = new_figure(height, title, rows, 2, sharex=True, squeeze=False)
     scales = _scales(labels, motion)
     for j, (units, values) in enumerate(
         zip(columns, (course.q, course.v), strict=True)
     ):
-        for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
+        axes_and_units = zip(panels[:, j], units.items(), strict=False)
+        for axes, (unit, which) in axes_and_units:
             count = len(which)
             too_many = bodies is None and count > _FEW
             if too_many:
-                which = _largest(which, [_range(values[:, i]) for i, _ in which])
+                ranges = [_range(values[:, i]) for i, _ in which]
+                which = _largest(which, ranges)
             at, words = zip(*which, strict=True)
             axes.plot(course.time, values[:, at], label=words)
             if j == 0 and unit == "m" and system is not None:
@@ -127,22 +128,19 @@ def motion(
             )
         for axes in panels[len(units) : -1, j]:
             axes.remove()
-    note = _draw_gaps(
-        panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts)
-    )
+    shown = _shown_contacts(motion, system, bodies, contacts)
+    note = _draw_gaps(panels[-1, 0], motion, shown)
     _finish_panel(panels[-1, 0], scales["m"], note)
     _draw_energies(panels[-1, 1], motion, course, system)
-    _finish_panel(
-        panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0
-    )
+    largest = float(np.nanmax(np.abs(motion.energy), initial=0.0))
+    _finish_panel(panels[-1, 1], largest or 1.0)
     for axes in figure.axes:
         if axes is not panels[-1, 1]:
             _draw_events(axes, motion)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
-    legend_below(
-        figure, 4, [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)]
-    )
+    lines = [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)]
+    legend_below(figure, 4, lines)
     return figure
 
 
@@ -173,8 +171,10 @@ def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
     """Largest sizes of coordinates and gaps by unit (1 for 0, and in rad); of rates
     over time.
     """
-    scales = {"m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
-    sizes = np.nanmax(np.abs(motion.q), axis=0, initial=0.0).tolist()
+    largest_gap = np.nanmax(np.abs(motion.gaps), initial=0.0)
+    scales = {"m": float(largest_gap)}
+    largest = np.nanmax(np.abs(motion.q), axis=0, initial=0.0)
+    sizes = largest.tolist()
     for label, size in zip(labels, sizes, strict=True):
         unit = split_name(label)[1]
         scales[unit] = max(scales.get(unit, 0.0), size)
@@ -185,7 +185,8 @@ def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
 
 def _largest(entries: list[Any], sizes: Sequence[Any]) -> list[Any]:
     """The `_FEW` entries with the largest `sizes`, in their own order."""
-    best = sorted(range(len(entries)), key=lambda i: sizes[i], reverse=True)[:_FEW]
+    index = range(len(entries))
+    best = sorted(index, key=lambda i: sizes[i], reverse=True)[:_FEW]
     return [entries[i] for i in sorted(best)]
 
 
@@ -227,7 +228,8 @@ def _labels(
     n = motion.q.shape[-1]
     rates = motion.velocity.shape[-1]
     known = () if system is None else system.body.names
-    labels = [*known, *(f"q{i + 1}" for i in range(len(known), n))]
+    unnamed = (f"q{i + 1}" for i in range(len(known), n))
+    labels = [*known, *unnamed]
     for i, name in enumerate(names[:n]):
         unit = split_name(labels[i])[1]
         if unit and not split_name(name)[1]:
@@ -248,7 +250,8 @@ def _by_unit(
     Only those of `bodies` (from 0), the numbers at the end of x1, y1, ...; None: all.
     """
     by_unit: dict[str, list[tuple[int, str]]] = {}
-    numbers = [re.search(r"\d*(?='?$)", split_name(name)[0]) for name in names]
+    words = [split_name(name)[0] for name in names]
+    numbers = [re.search(r"\d*(?='?$)", word) for word in words]
     owners = [int(found[0]) - 1 if found and found[0] else None for found in numbers]
     for body in bodies or ():
         if body not in owners:
@@ -281,17 +284,21 @@ def course_of(motion: Motion) -> _Course:
     events = motion.events
     rows = np.asarray(motion.events.kind) > 0
     # rows of the record that hold an event: its velocities before and after (E, 2, n)
-    jumps = np.stack([events.velocity_before, events.velocity_after], axis=1)[rows]
-    time = np.concatenate([motion.time, np.repeat(np.asarray(events.time)[rows], 2)])
-    q = np.concatenate([motion.q, np.repeat(np.asarray(events.q)[rows], 2, axis=0)])
-    v = np.concatenate([motion.velocity, jumps.reshape(-1, jumps.shape[-1])])
+    velocities = [events.velocity_before, events.velocity_after]
+    jumps = np.stack(velocities, axis=1)[rows]
+    event_time = np.asarray(events.time)[rows]
+    time = np.concatenate([motion.time, np.repeat(event_time, 2)])
+    event_q = np.asarray(events.q)[rows]
+    q = np.concatenate([motion.q, np.repeat(event_q, 2, axis=0)])
+    in_turn = jumps.reshape(-1, jumps.shape[-1])
+    v = np.concatenate([motion.velocity, in_turn])
     # samples up to 0, then before an event at 1, 3, ..., after it at 2, 4, ...
     after = np.arange(len(time)) - len(motion.time) + 1
     # stable: of events at one time before and after of the first, then of the second
     order = np.argsort(time, kind="stable")
-    return _Course(
-        time[order], q[order], v[order], (after[order] > 0) & (after[order] % 2 == 0)
-    )
+    number = after[order]
+    is_after = (number > 0) & (number % 2 == 0)
+    return _Course(time[order], q[order], v[order], is_after)
 
 
 def base_path(system: System, time: np.ndarray) -> np.ndarray:
@@ -309,7 +316,8 @@ def base_path(system: System, time: np.ndarray) -> np.ndarray:
     if directions is None:
         return path
     moved = path @ np.asarray(system.base_directions).T
-    return np.linalg.lstsq(np.asarray(directions), moved.T, rcond=None)[0].T
+    solution = np.linalg.lstsq(np.asarray(directions), moved.T, rcond=None)
+    return solution[0].T
 
 
 def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
@@ -318,15 +326,18 @@ def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
     """
     if system.base is None:
         return
-    reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
+    known = np.isfinite(np.asarray(motion.energy))
+    reached = np.asarray(motion.time)[known]
     if not len(reached):
         return
     time = np.linspace(reached[0], reached[-1], _BASEPOINTS)
     path = base_path(system, time)
     words = ("",) if path.shape[1] == 1 else (" x", " y", " z")
-    for values, word, style in zip(path.T, words, ("--", ":", "-."), strict=False):
+    styles = ("--", ":", "-.")
+    for values, word, style in zip(path.T, words, styles, strict=False):
         if np.ptp(values) > 0:
-            axes.plot(time, values, style, color="black", lw=0.8, label=f"base{word}")
+            label = f"base{word}"
+            axes.plot(time, values, style, color="black", lw=0.8, label=label)
 
 
 def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
@@ -343,7 +354,8 @@ def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
     # contacts of each event
     closed = np.zeros((len(events.time), values.shape[1]), bool)
     if single:
-        closed = (np.asarray(events.kind) > 0)[:, None] & np.asarray(events.contacts)
+        is_event = (np.asarray(events.kind) > 0)[:, None]
+        closed = is_event & np.asarray(events.contacts)
     note = ""
     if shown is None:
         ever = closed.any(axis=0)
@@ -353,16 +365,19 @@ def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
         else:
             far = np.inf
         near = list(np.flatnonzero(least <= far))
-        shown = _largest(near, [(closed[:, j].sum(), -least[j]) for j in near])
+        weights = [(closed[:, j].sum(), -least[j]) for j in near]
+        shown = _largest(near, weights)
         if len(near) > _FEW:
             note = f"{_FEW} of {values.shape[1]}"
         else:
             note = ""
     for j in shown:
         rows = closed[:, j]
-        time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
+        event_time = np.asarray(events.time)[rows]
+        time = np.concatenate([motion.time, event_time])
         order = np.argsort(time, kind="stable")
-        gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
+        at_events = np.zeros(rows.sum())
+        gap = np.concatenate([values[:, j], at_events])[order]
         axes.plot(time[order], gap, label=f"contact {j + 1}")
     axes.set_ylabel("gaps [m]" if single else "least gap [m]")
     return note
@@ -375,7 +390,8 @@ def _event_styles(motion: Motion) -> list[tuple[str, dict[str, Any]]]:
     styles: dict[str, dict[str, Any]] = {}
     if len(motion.event_times("impact")) <= _MANY:
         styles["impact"] = {"color": GREY, "lw": 0.4}
-    for kind, style in zip(_MARKED, ("--", ":", "-."), strict=True):
+    dashes = ("--", ":", "-.")
+    for kind, style in zip(_MARKED, dashes, strict=True):
         styles[kind] = {"color": "black", "lw": 0.8, "ls": style}
     return [
         (kind, style) for kind, style in styles.items() if len(motion.event_times(kind))
@@ -421,9 +437,11 @@ def _draw_energies(
         ("the base gave", motion.base_work),
         ("forces gave", motion.force_work),
     )
-    rounding = _FLAT * float(np.nanmax(np.abs(motion.energy), initial=0.0))
+    largest = np.nanmax(np.abs(motion.energy), initial=0.0)
+    rounding = _FLAT * float(largest)
     for (label, value), colour in zip(others, COLOURS[1:], strict=False):
-        if np.nanmax(np.abs(np.asarray(value)), initial=0.0) > rounding:
+        size = np.nanmax(np.abs(np.asarray(value)), initial=0.0)
+        if size > rounding:
             axes.plot(time, value, "--", color=colour, label=label)
     axes.set_ylabel("energy [J]")
 
@@ -490,15 +508,11 @@ def phase_portrait(
     speed = course.v[:, rate]
     # the line breaks between before and after an event
     cut = np.flatnonzero(course.after)
-    axes.plot(
-        np.insert(position, cut, np.nan),
-        np.insert(speed, cut, np.nan),
-        color=COLOURS[0],
-    )
+    with_breaks = [np.insert(x, cut, np.nan) for x in (position, speed)]
+    axes.plot(*with_breaks, color=COLOURS[0])
     jumps = np.stack([cut - 1, cut])
-    lines = axes.plot(
-        position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0
-    )
+    style = {"color": COLOURS[1], "lw": 0.8, "zorder": 0}
+    lines = axes.plot(position[jumps], speed[jumps], "--", **style)
     if names or system is not None:
         hint = ""
     else:
@@ -523,8 +537,10 @@ def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     point = POINT * (np.ptp(q) or 1.0)  # radius of a point mass [m]
     curves = body.outlines(q, point)
     floors = [plane_of(*floor) for floor in body.floors]
-    set_limits(axes, [curves], np.zeros((1, 2)), floors)
-    for points, colour in zip(curves, colours_of(body, q, point), strict=True):
+    origin = np.zeros((1, 2))
+    set_limits(axes, [curves], origin, floors)
+    colours = colours_of(body, q, point)
+    for points, colour in zip(curves, colours, strict=True):
         axes.plot(*points.T, color=colour)
     for angle, offset in body.floors:
         # nearest to the origin
@@ -542,7 +558,8 @@ def plane_of(angle: float, offset: float) -> tuple[np.ndarray, float]:
     """Normal n (2,) and offset of the plane `n^T x = offset` inclined by `angle`
     [rad].
     """
-    return np.array([-np.sin(angle), np.cos(angle)]), float(offset)
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+    return normal, float(offset)
 
 
 def set_limits(
@@ -556,9 +573,11 @@ def set_limits(
     That is the foot, on `n^T (x - ground[0]) = offset`, of the middle of the curves.
     """
     points = np.concatenate([curve for frame in curves for curve in frame])
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    lowest = points.min(axis=0)
+    middle = (lowest + points.max(axis=0)) / 2
     feet = [middle - (n @ (middle - ground[0]) - offset) * n for n, offset in floors]
-    points = np.concatenate([points, *(foot[None] for foot in feet)])
+    as_points = (foot[None] for foot in feet)
+    points = np.concatenate([points, *as_points])
     low = points.min(axis=0)
     high = points.max(axis=0)
     half = 0.55 * float((high - low).max()) or 1.0

@@ -109,21 +109,22 @@ def force_chains(
     p = np.asarray(impulse, float)
     check_shape("impulse", p, (scene.contacts,), "one per contact")
     d = pile.dimension
-    centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
+    coordinates = np.asarray(q, float).reshape(pile.count, -1)
+    centres = coordinates[:, :d]
     # bodies of each contact; second < 0: a wall
     first, second = scene.pairs.neighbours.bodies.T
-    ends = np.where(
-        (second < 0)[:, None],
-        _points_on_walls(pile, scene.pairs, centres),
-        centres[second],
-    )
-    size = np.abs(p) / (np.abs(p).max() or 1.0)
+    on_wall = (second < 0)[:, None]
+    at_walls = _points_on_walls(pile, scene.pairs, centres)
+    ends = np.where(on_wall, at_walls, centres[second])
+    largest = np.abs(p).max() or 1.0
+    size = np.abs(p) / largest
     drawn = np.flatnonzero(size > _FAINT)
     drawn = drawn[np.argsort(size[drawn])]
     figure, axes = new_figure(5.0, title)
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
-    lines = np.stack([centres[first], ends], axis=1)[drawn]
+    every_line = np.stack([centres[first], ends], axis=1)
+    lines = every_line[drawn]
     if d != 2:
         lines = projected(lines)
     widths = _THICKEST * size[drawn]
@@ -153,7 +154,8 @@ def _points_on_walls(
     n = normal[:, :d]
     if not len(walls):
         return centres[first]
-    offset = walls[np.argmax(n @ walls[:, :d].T, axis=1), d]
+    wall = np.argmax(n @ walls[:, :d].T, axis=1)
+    offset = walls[wall, d]
     height = np.sum(centres[first] * n, axis=1) - offset
     on_wall = centres[first] - height[:, None] * n
     if d == 2:
@@ -173,25 +175,31 @@ def _draw_chain(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     # of each contact, walls included
     apart = np.where(np.asarray(scene.closed), 0.0, _GAP)
     # the gap to the left of each body
-    before = np.concatenate(
-        [apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]]
-    )
-    centre = np.cumsum(before + np.concatenate([radius[:1], radius[:-1] + radius[1:]]))
+    inner = apart[left : len(mass) - 1 + left]
+    before = np.concatenate([apart[:1] if left else [0.0], inner])
+    neighbours = radius[:-1] + radius[1:]
+    step = np.concatenate([radius[:1], neighbours])
+    centre = np.cumsum(before + step)
     end = centre[-1] + radius[-1]
     fastest = np.abs(velocity).max() or 1.0
-    for i, (x, r, v) in enumerate(zip(centre, radius, velocity, strict=True)):
+    circles = zip(centre, radius, velocity, strict=True)
+    for i, (x, r, v) in enumerate(circles):
         colour = colour_of(i)
-        axes.add_patch(Circle((x, 0.0), r, fc=colour, alpha=0.35, ec=colour))
+        circle = Circle((x, 0.0), r, fc=colour, alpha=0.35, ec=colour)
+        axes.add_patch(circle)
         write(axes, (x, 0.0), f"{i + 1}", fontsize="medium")
         write(axes, (x, -1.35), f"{mass[i]:.3g} kg")
         write(axes, (x, 1.75), f"{v:.3g} m/s")
         if v:
             tip = x + _ARROW * v / fastest / 2
             arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2}
-            axes.annotate("", (tip, 1.3), (2 * x - tip, 1.3), arrowprops=arrow)
+            tail = (2 * x - tip, 1.3)
+            axes.annotate("", (tip, 1.3), tail, arrowprops=arrow)
     for wall, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):
         if wall:
-            axes.add_patch(Rectangle((x, -1.1), 0.3, 2.2, color=GREY, alpha=0.5, lw=0))
+            block = Rectangle((x, -1.1), 0.3, 2.2, color=GREY, alpha=0.5, lw=0)
+            axes.add_patch(block)
     margin = max(1.2, (12.0 - end) / 2)  # a single body is not as wide as the picture
-    axes.set(xlim=(-margin, end + margin), ylim=(-1.7, 2.1), aspect="equal")
+    width = (-margin, end + margin)
+    axes.set(xlim=width, ylim=(-1.7, 2.1), aspect="equal")
     axes.axis("off")

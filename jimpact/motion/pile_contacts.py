@@ -76,7 +76,8 @@ def contacts_of_step(
     v = as_float_array("v", v)
     check_concrete("q", q)
     system, law, q, v = in_common_dtype(system, law, q, v)
-    start = start_of(system, law, q, v, (t, t + step), closed_below)
+    times = (t, t + step)
+    start = start_of(system, law, q, v, times, closed_below)
     check_stepped_law(
         system, law, start.contacts, law.joins_step and system.friction is None
     )

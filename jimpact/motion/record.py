@@ -112,9 +112,8 @@ def joined(parts: list[Events], most: int) -> Events:
         for name in columns
     }
     count = np.sum([x.count for x in parts], dtype=np.int32)
-    return Events(
-        jnp.asarray(count), **{name: jnp.asarray(x) for name, x in rows.items()}
-    )
+    columns_of_jax = {name: jnp.asarray(x) for name, x in rows.items()}
+    return Events(jnp.asarray(count), **columns_of_jax)
 
 
 def with_row(
@@ -178,9 +177,8 @@ class Motion(eqx.Module):
     @property
     def ledger_residual(self) -> Float[Array, "... S"]:
         """Error of the ledger [J]: `T + V - (T + V)(t_0)` without all works."""
-        work = (
-            self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
-        )
+        by_contacts = jnp.sum(self.contact_work, axis=(-2, -1))
+        work = self.force_work + self.base_work + by_contacts
         return self.energy - self.energy[..., :1] - work
 
     def event_times(self, kind: str = "impact") -> np.ndarray:
@@ -189,9 +187,8 @@ class Motion(eqx.Module):
             raise ValueError(
                 f"Argument `kind` must be one of {EVENT_KINDS}, but is {kind!r}."
             )
-        return np.asarray(self.events.time)[
-            np.asarray(self.events.kind) == KIND_CODE[kind]
-        ]
+        chosen = np.asarray(self.events.kind) == KIND_CODE[kind]
+        return np.asarray(self.events.time)[chosen]
 
     def restart(self, t_end: float) -> dict[str, Any]:
         """Arguments `q0`, `v0`, `t_end` of `simulate` with which one motion goes on, on
@@ -210,7 +207,8 @@ class Motion(eqx.Module):
             raise ValueError(
                 "A batch of motions has no common end: pick one motion of it."
             )
-        return int(np.isfinite(np.asarray(self.q)).all(axis=-1).sum())
+        finite = np.isfinite(np.asarray(self.q)).all(axis=-1)
+        return int(finite.sum())
 
     def then(self, later: "Motion") -> "Motion":
         """This motion and a `later` one, which goes on from its end (`restart`), as one
@@ -237,19 +235,17 @@ class Motion(eqx.Module):
                 added = 0.0
             samples[name] = jnp.concatenate([first, second + added])
         # events after the last sample occur in `later` again
-        known = np.asarray(self.events.kind > 0) & (
-            np.asarray(self.events.time) <= last
-        )
+        happened = np.asarray(self.events.kind > 0)
+        known = happened & (np.asarray(self.events.time) <= last)
         events = jax.tree.map(
             lambda x: np.asarray(x)[known] if np.ndim(x) else x, self.events
         )
-        events = dataclasses.replace(events, count=jnp.int32(known.sum()))
-        table = joined(
-            [events, later.events], int(known.sum()) + later.events.time.shape[0]
-        )
-        return dataclasses.replace(
-            later, **samples, events=table, steps=self.steps + later.steps
-        )
+        known_count = jnp.int32(known.sum())
+        events = dataclasses.replace(events, count=known_count)
+        rows = int(known.sum()) + later.events.time.shape[0]
+        table = joined([events, later.events], rows)
+        steps = self.steps + later.steps
+        return dataclasses.replace(later, **samples, events=table, steps=steps)
 
     def explain_failure(self, row: Status, lanes: np.ndarray) -> str:
         """End of a message: names of the law's status codes in the failed motions
@@ -259,8 +255,10 @@ class Motion(eqx.Module):
         """
         if row.name != "law_failed":
             return ""
-        codes = np.asarray(self.events.status).reshape(self.status.size, -1)[lanes]
-        names = [STATUS[code].name for code in np.unique(codes.max(axis=1)) if code]
+        every_code = np.asarray(self.events.status).reshape(self.status.size, -1)
+        codes = every_code[lanes]
+        gravest = np.unique(codes.max(axis=1))
+        names = [STATUS[code].name for code in gravest if code]
         if names:
             return f": {', '.join(names)}"
         return ""
@@ -286,10 +284,12 @@ class Motion(eqx.Module):
         None).
         """
         n = int(self.events.count)
-        rows = {
-            k: np.asarray(v)[:n] for k, v in vars(self.events).items() if k != "count"
+        columns = {
+            k: np.asarray(v) for k, v in vars(self.events).items() if k != "count"
         }
-        events = rows | {"kind": [EVENT_KINDS[k] for k in rows["kind"]]}
+        rows = {name: column[:n] for name, column in columns.items()}
+        kinds = [EVENT_KINDS[k] for k in rows["kind"]]
+        events = rows | {"kind": kinds}
         status = STATUS[int(self.status)].name
         return fields_as_data(self, "events") | as_data(
             {"status": status, "events": events}
@@ -309,8 +309,9 @@ class Motion(eqx.Module):
             if n and name != "none"
         ]
         row = STATUS[int(self.status)]
-        reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
-        last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
+        known = np.isfinite(np.asarray(self.energy))
+        reached = np.asarray(self.time)[known]
+        last = int(known.sum()) - 1
         shares = contact_shares(self).items()
         works = {name: work[max(last, 0)] for name, work in shares}
         works |= {
@@ -343,7 +344,8 @@ _SAMPLED = tuple(name for name in Motion.__dataclass_fields__ if name not in _WH
 def _arrays(motion: Motion) -> dict[str, jax.Array]:
     """All fields by name, those of events as `events.name`."""
     rows = {f"events.{name}": x for name, x in vars(motion.events).items()}
-    return {name: x for name, x in vars(motion).items() if name != "events"} | rows
+    samples = {name: x for name, x in vars(motion).items() if name != "events"}
+    return samples | rows
 
 
 def read_motion(path: Path) -> Motion:
@@ -366,7 +368,8 @@ def read_motion(path: Path) -> Motion:
             f"{FORMAT}."
         )
     for name, words in _NAMES.items():
-        arrays[name] = np.vectorize(words.index, otypes=[np.int32])(arrays[name])
+        index_of = np.vectorize(words.index, otypes=[np.int32])
+        arrays[name] = index_of(arrays[name])
     if jnp.asarray(arrays["q"]).dtype != arrays["q"].dtype:
         raise ValueError(f"{wrong}is in {arrays['q'].dtype}: enable jax_enable_x64.")
     values = {name: jnp.asarray(x) for name, x in arrays.items()}
@@ -384,7 +387,8 @@ def contact_shares(motion: Motion) -> dict[str, np.ndarray]:
     works = np.asarray(motion.contact_work).sum(axis=-1)
     normal, tangential = works.T
     added = np.diff(tangential[np.isfinite(tangential)])
-    largest = np.nanmax(np.abs(np.asarray(motion.energy)), initial=0.0)
+    energy = np.abs(np.asarray(motion.energy))
+    largest = np.nanmax(energy, initial=0.0)
     if np.max(added, initial=0.0) > _ROUNDED * largest:
         return {"contacts and friction": normal + tangential}
     return {"the contacts": normal, "friction": tangential}
@@ -394,7 +398,8 @@ def _work_report(works: dict[str, Any]) -> str:
     """Sentence of the works [J] by source, `gave` > 0 and `took` < 0; roundings are
     left out.
     """
-    least = _ROUNDING * max(abs(float(work)) for work in works.values())
+    sizes = (abs(float(work)) for work in works.values())
+    least = _ROUNDING * max(sizes)
     parts = [
         f"{source} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
         for source, work in works.items()
@@ -405,7 +410,8 @@ def _work_report(works: dict[str, Any]) -> str:
 
 def _batch_report(motion: Motion) -> str:
     """Line with the number of motions of a batch, and how many have each status."""
-    codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
+    status = np.asarray(motion.status)
+    codes, counts = np.unique(status, return_counts=True)
     parts = ", ".join(
         f"{n} {STATUS[c].name}" for c, n in zip(codes, counts, strict=True)
     )

@@ -74,10 +74,10 @@ def end_of(
     flight = run.flight
     stuck = flight.stuck & (run.status == CODE["ok"])
     why = why_stuck(problem.system, flight, problem.q0, problem.times)
-    status = jnp.where(stuck, why, run.status).astype(jnp.int32)
-    return MotionEnd(
-        run.table, flight.sample, run.event_count, flight.steps, status, smooth, more
-    )
+    code = jnp.where(stuck, why, run.status)
+    status = code.astype(jnp.int32)
+    counts = (flight.sample, run.event_count, flight.steps)
+    return MotionEnd(run.table, *counts, status, smooth, more)
 
 
 def course_of(
@@ -110,7 +110,8 @@ def why_stuck(
     q = system.body.moved(state.q, ahead * state.v)
     t = state.t + ahead
     force = user_force(system, q, state.v, t)
-    rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
+    mass = mass_at(system, q)
+    rates = free_acceleration(system, q, state.v, force, mass)
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, CODE["max_steps"], CODE["not_finite"])
@@ -122,5 +123,6 @@ def why_stuck(
         least = jnp.min(now / begin)
     else:
         scale = 1 / jnp.sqrt(jnp.diagonal(begin))
-        least = jnp.linalg.eigvalsh(now * scale[:, None] * scale[None, :])[0]
+        scaled = now * scale[:, None] * scale[None, :]
+        least = jnp.linalg.eigvalsh(scaled)[0]
     return jnp.where(~(least > _SINGULAR), CODE["singular_mass"], code)

@@ -134,9 +134,8 @@ def simulate(
         substeps = substeps_of(method, *as_times(t_end), count)
         joint = law.joins_step and system.friction is None
         check_stepped_law(system, law, start.contacts, joint)
-        return _waited(
-            _stepped, (start, law, substeps, count, joint, rows), method.progress
-        )
+        stepped_with = (start, law, substeps, count, joint, rows)
+        return _waited(_stepped, stepped_with, method.progress)
     if isinstance(method, ContactForces):
         slow = SLOW
     else:
@@ -199,13 +198,14 @@ def _in_runs(
         show("motion", 0.0, duration)
         while True:
             left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
-            motion, numbers = _events(
-                start, law, settings, Past(left, numbers), samples, CHUNK
-            )
+            goes_on = Past(left, numbers)
+            motion, numbers = _events(start, law, settings, goes_on, samples, CHUNK)
             parts.append(motion.events)
-            if int(motion.status) != CODE["max_events"] or CHUNK * len(parts) >= most:
+            too_many = CHUNK * len(parts) >= most
+            if int(motion.status) != CODE["max_events"] or too_many:
                 return dataclasses.replace(motion, events=joined(parts, most))
-            show("motion", float(motion.events.time[-1] - start.time), duration)
+            reached = float(motion.events.time[-1] - start.time)
+            show("motion", reached, duration)
 
 
 @quick_jit
@@ -266,9 +266,8 @@ def _problem(
     times = _equal_times(start, samples)
     system = start.system
     mu = start.friction
-    return MotionProblem(
-        system, law, mu, settings, start.q, start.v, times, start.contacts, past
-    )
+    begin = (start.q, start.v, times)
+    return MotionProblem(system, law, mu, settings, *begin, start.contacts, past)
 
 
 def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Motion:
@@ -293,9 +292,8 @@ def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Moti
         rows = (jnp.where(by_sample(reached, x.ndim), x, x[:1]) for x in args)
         values = over(function)(*rows)
         # times that were not reached are NaN, and so are their derivatives
-        return jnp.where(
-            by_sample(reached, values.ndim), values, by_sample(at.t, values.ndim)
-        )
+        where = by_sample(reached, values.ndim)
+        return jnp.where(where, values, by_sample(at.t, values.ndim))
 
     return Motion(
         time=times,
@@ -322,5 +320,6 @@ def _one_by_one(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
 
 def _equal_times(start: Start, samples: int) -> Float[Array, " S"]:
     """Times [s] of samples equally spaced from start to end, both included."""
-    share = jnp.arange(samples, dtype=start.time.dtype) / (samples - 1)
+    index = jnp.arange(samples, dtype=start.time.dtype)
+    share = index / (samples - 1)
     return start.time + share * (start.end - start.time)

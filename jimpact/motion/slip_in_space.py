@@ -100,8 +100,10 @@ def slip_axes(
     speed = length(u)
     slides = modes.active & ~modes.stick
     starts = slides & (speed <= NO_SLIP * speed_scale)
-    first = jnp.stack([jnp.ones_like(mu), jnp.zeros_like(mu)], axis=1)
-    moving = jnp.where((slides & ~starts)[:, None], direction(u), first)
+    one = jnp.ones_like(mu)
+    first = jnp.stack([one, jnp.zeros_like(mu)], axis=1)
+    under_way = (slides & ~starts)[:, None]
+    moving = jnp.where(under_way, direction(u), first)
     along = jax.lax.cond(
         any_lane(jnp.any(starts)),
         lambda: _first_directions(contacts, mu, modes, starts, moving),
@@ -112,8 +114,10 @@ def slip_axes(
     # a derivative of the direction that is kept would be that of a turn which goes on
     kept = (last & (speed > 0))[:, None]
     along = jnp.where(kept, jax.lax.stop_gradient(along), along)
-    least = jnp.where(last, 1.0, AHEAD) * jax.lax.stop_gradient(speed)
-    return SlipAxes(along, speed, jnp.where(starts, FIRST * speed_scale, least), last)
+    share = jnp.where(last, 1.0, AHEAD)
+    least = share * jax.lax.stop_gradient(speed)
+    at_least = jnp.where(starts, FIRST * speed_scale, least)
+    return SlipAxes(along, speed, at_least, last)
 
 
 def slip_within(
@@ -145,7 +149,8 @@ def straightened(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Mode
     the next step would begin in any direction, and derivatives with it.
     """
     ahead = by_contact(rate, len(axes.speed))[:, 0]
-    ends = modes.active & ~modes.stick & axes.last & (jnp.abs(ahead) < axes.speed)
+    slides = modes.active & ~modes.stick
+    ends = slides & axes.last & (jnp.abs(ahead) < axes.speed)
     return modes._replace(sign=jnp.where(ends, BEGINS, modes.sign))
 
 
@@ -161,11 +166,15 @@ def log_rates(
     assert force.tangential is not None
     m = len(axes.speed)
     both = jnp.concatenate([force.normal, force.tangential])
-    growth = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)
+    acceleration = contacts.approach + contacts.delassus @ both
+    growth = by_contact(acceleration[m:], m)
     u = by_contact(contacts.tangent.rate, m)
-    square = jnp.maximum(jnp.sum(u * u, axis=1), axes.least**2)
-    slides = modes.active & ~modes.stick & (modes.sign != BEGINS) & ~axes.last
-    return quotient(jnp.sum(u * growth, axis=1), square, where=slides)
+    speed_squared = jnp.sum(u * u, axis=1)
+    square = jnp.maximum(speed_squared, axes.least**2)
+    slides = modes.active & ~modes.stick & ~axes.last
+    slides &= modes.sign != BEGINS
+    power = jnp.sum(u * growth, axis=1)
+    return quotient(power, square, where=slides)
 
 
 def turning_errors(
@@ -198,19 +207,21 @@ def _first_directions(
     m = len(mu)
     # slip along d, not against it
     plain = modes._replace(sign=jnp.ones_like(modes.sign))
-    stuck = forces(contacts, mu, plain._replace(stick=modes.stick | starts), moving)
+    sticks = modes.stick | starts
+    stuck = forces(contacts, mu, plain._replace(stick=sticks), moving)
     assert stuck.tangential is not None
     against = -by_contact(stuck.tangential, m)
     some = starts & (length(against) > 0)
-    angle = jnp.arctan2(
-        jnp.where(some, against[:, 1], 0.0), jnp.where(some, against[:, 0], 1.0)
-    )
+    ahead = jnp.where(some, against[:, 0], 1.0)
+    aside = jnp.where(some, against[:, 1], 0.0)
+    angle = jnp.arctan2(aside, ahead)
 
     def unit(angle: Float[Array, " m"]) -> Float[Array, "m 2"]:
         """Directions d = (cos, sin) of the angles where slip starts, else the moving
         ones.
         """
-        turned = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        components = [jnp.cos(angle), jnp.sin(angle)]
+        turned = jnp.stack(components, axis=1)
         return jnp.where(starts[:, None], turned, moving)
 
     def across(
@@ -223,8 +234,10 @@ def _first_directions(
         sliding = forces(contacts, mu, plain, d)
         assert sliding.tangential is not None
         all_forces = jnp.concatenate([sliding.normal, sliding.tangential])
-        rate = by_contact((contacts.approach + contacts.delassus @ all_forces)[m:], m)
-        turn = jnp.where(starts, d[:, 0] * rate[:, 1] - d[:, 1] * rate[:, 0], 0.0)
+        acceleration = contacts.approach + contacts.delassus @ all_forces
+        rate = by_contact(acceleration[m:], m)
+        cross = d[:, 0] * rate[:, 1] - d[:, 1] * rate[:, 0]
+        turn = jnp.where(starts, cross, 0.0)
         return turn, turn
 
     eye = jnp.eye(m, dtype=mu.dtype)
@@ -238,7 +251,8 @@ def _first_directions(
         # angles stay
         ridge = jnp.where(starts, -_RIDGE, 1.0)
         equations = jacobian / size + eye * ridge[:, None]
-        change = solve_by_pivots(equations, -turn[:, None] / size)[0][:, 0]
+        right = -turn[:, None] / size
+        change = solve_by_pivots(equations, right)[0][:, 0]
         return angle + jnp.clip(change, -_MOST_TURN, _MOST_TURN)
 
     return unit(jax.lax.fori_loop(0, _NEWTON, newton, angle))

@@ -147,8 +147,10 @@ class SpringMotionFlow(CompliantFlow):
         share = quotient(self.coulomb * x, stretched, where=beyond, otherwise=1.0)
         held = -(self.steep * secant * share)[:, None] * xi
         sliding = -(self.coulomb * push)[:, None] * n
-        side = jnp.where((const.slide == Slide.HOLDS)[:, None], held, sliding)
-        return jnp.where(loaded(const.phase)[:, None], side, 0.0)
+        holds = (const.slide == Slide.HOLDS)[:, None]
+        side = jnp.where(holds, held, sliding)
+        acts = loaded(const.phase)[:, None]
+        return jnp.where(acts, side, 0.0)
 
     def directions(
         self,
@@ -170,18 +172,21 @@ class SpringMotionFlow(CompliantFlow):
         first = jnp.where(drags[:, None], direction(u), n)
         side = self.tangential_forces(const, at, push, first).reshape(-1)
         both = jnp.concatenate([push, side])
-        growth = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)  # u'
+        acceleration = contacts.approach + contacts.delassus @ both
+        growth = by_contact(acceleration[m:], m)  # u'
         across = jnp.stack([-first[:, 1], first[:, 0]], axis=1)
         follows = self.steep * length(u)
         pace = follows + self.coulomb * self._sinking(const, contacts)
         # x falls faster than n follows u: the limit closes before n turns
         pace = jnp.maximum(pace, 0.5 * follows)
         # mu x phi' / pace with phi' = u x u' / |u|^2
-        turning = self.coulomb * at.contact[0] * jnp.sum(across * growth, axis=1)
+        aside = jnp.sum(across * growth, axis=1)
+        turning = self.coulomb * at.contact[0] * aside
         divisor = length(u) * pace
         behind = drags & (divisor > 0)
         lag = quotient(turning, divisor, where=behind)
-        return jnp.cos(lag)[:, None] * first - jnp.sin(lag)[:, None] * across
+        ahead = jnp.cos(lag)[:, None] * first
+        return ahead - jnp.sin(lag)[:, None] * across
 
     def spring_rates(  # type: ignore[override]
         self,
@@ -196,13 +201,16 @@ class SpringMotionFlow(CompliantFlow):
         assert contacts.tangent is not None
         u = by_contact(contacts.tangent.rate, len(const.slide))
         n = direction(springs(at))
-        across = u - jnp.sum(n * u, axis=1, keepdims=True) * n
+        along = jnp.sum(n * u, axis=1, keepdims=True)
+        across = u - along * n
         r = self.limit(at.contact[0])
         turns = (const.slide == Slide.SLIDES) & (r > 0)
         turning = across / jnp.where(turns, r, 1.0)[:, None]
         rate = jnp.where(turns[:, None], turning, 0.0)
-        rate = jnp.where((const.slide == Slide.HOLDS)[:, None], u, rate)
-        return jnp.where(loaded(const.phase)[:, None], rate, 0.0).T
+        holds = (const.slide == Slide.HOLDS)[:, None]
+        rate = jnp.where(holds, u, rate)
+        acts = loaded(const.phase)[:, None]
+        return jnp.where(acts, rate, 0.0).T
 
     def sizes_of_springs(self, at: State) -> list[Float[Array, " m"]]:
         """Sizes of the rows of springs, of which a step may err by `rtol`.
@@ -214,7 +222,8 @@ class SpringMotionFlow(CompliantFlow):
         modes = self.slide_of_start
         depth = self.scales.depth
         scale = jnp.where(self.coulomb > 0, self.limit(depth), depth)
-        share = jnp.clip(at.contact[0] / self.scales.depth, self.rtol, 1.0)
+        relative = at.contact[0] / self.scales.depth
+        share = jnp.clip(relative, self.rtol, 1.0)
         size = jnp.where(modes == Slide.HOLDS, scale, 1 / share)
         return [size] * len(at.spring)
 
@@ -245,17 +254,22 @@ class SpringMotionFlow(CompliantFlow):
         acts = loaded(const.phase)
         rubs = acts & (self.coulomb > 0)
         holds = const.slide == Slide.HOLDS
-        scale = jnp.where(self.coulomb > 0, self.limit(self.scales.depth), 1.0)
+        deepest = self.limit(self.scales.depth)
+        scale = jnp.where(self.coulomb > 0, deepest, 1.0)
         r = self.limit(x)
-        left = (r - length(springs(at))) / scale + BEYOND * self.rtol
-        slip = jnp.sum(n * u, axis=1) - self.limit(self._sinking(const, contacts))
-        slip = slip / (self.scales.slip + self.limit(self.scales.speed))
+        within = (r - length(springs(at))) / scale
+        left = within + BEYOND * self.rtol
+        limit_rate = self.limit(self._sinking(const, contacts))
+        slip = jnp.sum(n * u, axis=1) - limit_rate
+        fastest = self.scales.slip + self.limit(self.scales.speed)
+        slip = slip / fastest
         friction = jnp.where(holds, left, slip)
         friction = jnp.where(rubs | (acts & holds), friction, 1.0)
         parts = [normal, friction]
         if u.shape[1] == 2:
             lag = length(u) / self.swift
-            drags = jnp.where(const.slide == Slide.DRAGS, lag / QUARTER - r, r - lag)
+            drags_now = const.slide == Slide.DRAGS
+            drags = jnp.where(drags_now, lag / QUARTER - r, r - lag)
             parts.append(jnp.where(rubs & ~holds, drags / scale, 1.0))
         return self.from_margins(jnp.concatenate(parts), at)
 
@@ -285,7 +299,8 @@ class SpringMotionFlow(CompliantFlow):
         n = self.directions(const, at, contacts, force.normal)
         assert contacts.tangent is not None
         u = by_contact(contacts.tangent.rate, m)
-        n = jnp.where(length(n)[:, None] > 0, n, direction(u))  # xi = 0 yet
+        has_direction = length(n)[:, None] > 0  # else xi = 0 yet
+        n = jnp.where(has_direction, n, direction(u))
         holds = const.slide == Slide.HOLDS
         x = at.contact[0]
         stopped = fired & ~holds
@@ -294,10 +309,12 @@ class SpringMotionFlow(CompliantFlow):
         spring = jnp.where(stopped[:, None], at_limit, springs(at))
         slide = jnp.where(stopped, Slide.HOLDS, const.slide)
         other = jnp.where(begins, Slide.SLIDES, slide)
-        other = jnp.where(begins & self._swift(contacts, x), Slide.DRAGS, other)
+        drags = begins & self._swift(contacts, x)
+        other = jnp.where(drags, Slide.DRAGS, other)
         opposite = Slide.SLIDES + Slide.DRAGS - const.slide
         slide = jnp.where(toggled, opposite, other)
-        spring = jnp.where((begins | toggled)[:, None], n, spring)
+        turns = (begins | toggled)[:, None]
+        spring = jnp.where(turns, n, spring)
         phase, at = self.switched_phases(const.phase, at, which)
         was = loaded(const.phase)
         remains = loaded(phase) & was
@@ -305,7 +322,8 @@ class SpringMotionFlow(CompliantFlow):
         spring = jnp.where(remains[:, None], spring, 0.0)
         closes = loaded(phase) & ~was
         slide, spring = self.closed(closes, contacts, x, slide, spring)
-        spring = jnp.where((slide == Slide.DRAGS)[:, None], 0.0, spring)
+        drags_now = (slide == Slide.DRAGS)[:, None]
+        spring = jnp.where(drags_now, 0.0, spring)
         at = at._replace(spring=spring.T)
         rows = jnp.concatenate([phase, slide])
         return rows[:, None].astype(modes.dtype), packed(at)
@@ -333,12 +351,14 @@ class SpringMotionFlow(CompliantFlow):
         assert contacts.tangent is not None
         u = by_contact(contacts.tangent.rate, len(x))
         speed = jax.lax.stop_gradient(length(u))
-        widens = self.limit(jnp.abs(jax.lax.stop_gradient(contacts.normal.rate)))
+        closing = jax.lax.stop_gradient(contacts.normal.rate)
+        widens = self.limit(jnp.abs(closing))
         at_once = closes & (speed > widens)
         swift = at_once & self._swift(contacts, jnp.zeros_like(x))
         slide = jnp.where(at_once, Slide.SLIDES, slide)
         slide = jnp.where(swift, Slide.DRAGS, slide)
-        return slide, jnp.where(at_once[:, None], direction(u), spring)
+        new_spring = jnp.where(at_once[:, None], direction(u), spring)
+        return slide, new_spring
 
     def projected(  # type: ignore[override]
         self, const: SpringModes, at: State
@@ -363,7 +383,8 @@ def spring_modes(modes: Int[Array, "k 1"], like: State) -> SpringModes:
     """Phases and modes of springs from their rows (m each)."""
     phase, slide = modes[:, 0].reshape(2, -1)
     acts = loaded(phase)
-    friction = Modes(acts, slide == Slide.HOLDS, jnp.ones_like(like.contact[0]))
+    one = jnp.ones_like(like.contact[0])
+    friction = Modes(acts, slide == Slide.HOLDS, one)
     return SpringModes(phase, friction, slide)
 
 
@@ -392,8 +413,10 @@ def springs_at_start(
     x = at.contact[0]
     closes = loaded(phase) & (x <= 0)
     slide, spring = flow.closed(closes, contacts, x, holds, springs(at))
-    spring = jnp.where((slide == Slide.DRAGS)[:, None], 0.0, spring)
-    return jnp.concatenate([phase, slide]), at._replace(spring=spring.T)
+    drags = (slide == Slide.DRAGS)[:, None]
+    spring = jnp.where(drags, 0.0, spring)
+    both = jnp.concatenate([phase, slide])
+    return both, at._replace(spring=spring.T)
 
 
 def spring_flow(
@@ -428,7 +451,8 @@ def spring_flow(
     rows = [snap, by_speed, by_slip]
     if settings.spatial:
         rows.append(snap)
-    blank = jnp.zeros((len(packed(at)), 1), at.q.dtype)
+    state_rows = len(packed(at))
+    blank = jnp.zeros((state_rows, 1), at.q.dtype)
     longest = longest_step(system, problem.times)
     flow = SpringMotionFlow(
         system=system,
@@ -461,7 +485,8 @@ def _with_stored(
     m = contacts.normal.value.shape[0]
     x = jnp.maximum(at.contact[0], 0.0)
     w = jnp.diagonal(contacts.delassus)[:m]
-    stored = jnp.sqrt(w * force.force(x, jnp.zeros_like(x)) * x)
+    push = force.force(x, jnp.zeros_like(x))
+    stored = jnp.sqrt(w * push * x)
     return fastest.at[:m].max(jax.lax.stop_gradient(stored))
 
 
@@ -507,7 +532,8 @@ def stable(
     stiffness = stiffness_of(flow.force, x, jnp.zeros_like(x))
     acts = loaded(const.phase)
     holds = acts & (const.slide == Slide.HOLDS)
-    normal = jnp.where(acts, unloading(flow.force, const.phase, stiffness), 0.0)
+    steep = unloading(flow.force, const.phase, stiffness)
+    normal = jnp.where(acts, steep, 0.0)
     side = jnp.where(holds, flow.tangential_stiffness * stiffness, 0.0)
     fastest = _fastest(contacts, normal, side)
     some = fastest > 0
@@ -518,4 +544,5 @@ def stable(
         turns = jnp.zeros_like(turns)
     r = flow.limit(x)
     by_turning = quotient(TURN * r, slip, where=turns, otherwise=jnp.inf)
-    return jax.lax.stop_gradient(jnp.minimum(by_springs, jnp.min(by_turning)))
+    longest = jnp.minimum(by_springs, jnp.min(by_turning))
+    return jax.lax.stop_gradient(longest)

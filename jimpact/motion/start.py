@@ -73,7 +73,8 @@ def start_of(
         ValueError: for shapes and values that cannot be used, penetration but where it
             `may` be. TypeError: for functions of the system that JAX cannot trace.
     """
-    start, end = (as_float_array("t_end", t).astype(q.dtype) for t in as_times(t_end))
+    times = (as_float_array("t_end", t) for t in as_times(t_end))
+    start, end = (time.astype(q.dtype) for time in times)
     _check_coordinates(system, q, v, start, end)
     here = _at_start(system, q, v, start, end)
     # `q`, an array of the system, or one that its functions close over
@@ -83,13 +84,11 @@ def start_of(
         _check_values_at_start(system, here, start, end)
     below, rounding = _closed_gaps(q, here.gaps, closed_below)
     if not may_penetrate:
-        check_penetration("q0", here.gaps, jnp.maximum(below, system.body.overlap))
+        allowed = jnp.maximum(below, system.body.overlap)
+        check_penetration("q0", here.gaps, allowed)
     friction = _friction_of(system, law, here)
-    in_space = (
-        friction is not None
-        and here.tangents == 2 * here.contacts
-        and not is_pile(system)
-    )
+    two_tangents = here.tangents == 2 * here.contacts
+    in_space = friction is not None and two_tangents and not is_pile(system)
     return Start(
         system, q, v, start, end, friction, below, rounding, here.contacts, in_space
     )
@@ -144,7 +143,8 @@ def _check_coordinates(
     for time in (start, end):
         check_shape("t_end", time, (), "a time, or a pair (t_start, t_end)")
     # the argument `t_end` may hold the start, too
-    for name, value in (("q0", q), ("v0", v), ("t_end", start), ("t_end", end)):
+    named = (("q0", q), ("v0", v), ("t_end", start), ("t_end", end))
+    for name, value in named:
         check_values(name, value)
     if not is_traced((start, end)) and not float(end) > float(start):
         raise ValueError(
@@ -188,8 +188,10 @@ def _at_start(
         displacement = system.base
         instants = jnp.linspace(start, end, BASE_INSTANTS)
         base = jax.vmap(lambda t: jnp.atleast_1d(displacement(t)))(instants)
-    loads = (system.potential, (q,)), (system.force, (q, v, start))
-    others = [*loads, *((function, (q,)) for function in body.functions)]
+    with_time = (q, v, start)
+    loads = (system.potential, (q,)), (system.force, with_time)
+    of_body = ((function, (q,)) for function in body.functions)
+    others = [*loads, *of_body]
     tangents = jax.eval_shape(body.tangents, q)
     return _AtStart(
         mass=mass_at(system, q),
@@ -211,7 +213,8 @@ def _check_values_at_start(
     check_range("q0", system.body, here.valid)
     if here.base is None:
         return
-    bad = ~np.isfinite(np.asarray(here.base)).all(axis=1)
+    finite = np.isfinite(np.asarray(here.base))
+    bad = ~finite.all(axis=1)
     if bad.any():
         instants = np.linspace(float(start), float(end), BASE_INSTANTS)
         raise ValueError(
@@ -243,8 +246,10 @@ def _with_closures_as_leaves(
         """Functions of a system: force, potential, base, and those of its body."""
         return [s.force, s.potential, s.base, *s.body.functions]
 
-    args = [(q, v, t), (q,), (t,), *[(q,)] * len(system.body.functions)]
-    new = [converted(function, *x) for function, x in zip(parts(system), args)]
+    of_body = [(q,)] * len(system.body.functions)
+    args = [(q, v, t), (q,), (t,), *of_body]
+    calls = zip(parts(system), args)
+    new = [converted(function, *x) for function, x in calls]
     return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
 
 
@@ -258,9 +263,8 @@ def _closed_gaps(
     """
     q, f = jax.lax.stop_gradient((q, f))
     numpy: Any = jnp if is_traced((q, f)) else np  # on the host nothing is compiled
-    off = precision(q.dtype).noise * numpy.maximum(
-        numpy.abs(q).max(), numpy.abs(f).max()
-    )
+    largest = numpy.maximum(numpy.abs(q).max(), numpy.abs(f).max())
+    off = precision(q.dtype).noise * largest
     if closed_below is None:
         below = numpy.maximum(CLOSED_BELOW, MORE_CLOSED * off)
     else:

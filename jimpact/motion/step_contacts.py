@@ -37,7 +37,8 @@ class AllContacts(NamedTuple):
 
     def fastest(self, v: Float[Array, " n"]) -> Float[Array, ""]:
         """Bound [m/s] of the gap velocities that speeds as in v could give."""
-        return jnp.max(jnp.abs(v) @ jnp.abs(self.directions[:, :, 0]))
+        normals = jnp.abs(self.directions[:, :, 0])
+        return jnp.max(jnp.abs(v) @ normals)
 
     def velocity_change(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Change of velocity `M^-1 D x` by impulses x [N s]."""
@@ -55,7 +56,8 @@ class AllContacts(NamedTuple):
     def diagonal(self) -> Float[Array, "m b"]:
         """Diagonal of the Delassus matrix."""
         m, b = self.matrix.shape[:2]
-        return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
+        square = self.matrix.reshape(m * b, m * b)
+        return jnp.diagonal(square).reshape(m, b)
 
     def warm_start(self, last: Any) -> Float[Array, "m b"]:
         """Impulses of the last step, 0 of contacts that are open now."""
@@ -93,19 +95,21 @@ class ActiveContacts(NamedTuple):
 
     def rates(self, v: Float[Array, " n"]) -> Float[Array, "m b"]:
         """Gap velocities and slips `D^T v` [m/s]."""
-        of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
+        by_body = v.reshape(-1, self.inverse.shape[1])
+        of_bodies = jnp.pad(by_body, ((0, 1), (0, 0)))
 
         def one(row: Int[Array, ""], rates: Float[Array, "m b"]) -> Float[Array, "m b"]:
             """Rates with those of one block of contacts, `D . v` of their two
             bodies.
             """
-            bodies, directions = (
-                block(x, row) for x in (self.pairs.bodies, self.pairs.directions)
-            )
-            values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
+            bodies = block(self.pairs.bodies, row)
+            directions = block(self.pairs.directions, row)
+            rates_of_bodies = of_bodies[bodies][:, None]
+            values = jnp.sum(directions * rates_of_bodies, axis=(2, 3))
             return with_block(rates, values, row)
 
-        start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
+        shape = self.pairs.directions.shape[:2]
+        start = jnp.zeros(shape, v.dtype)
         return over_blocks(self.pairs.filled, one, start)
 
     def fastest(self, v: Float[Array, " n"]) -> Float[Array, ""]:
@@ -114,7 +118,8 @@ class ActiveContacts(NamedTuple):
 
     def velocity_change(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Change of velocity `M^-1 D x` by impulses x [N s]."""
-        return self.generalized_impulse(x) * self.inverse[:-1].reshape(-1)
+        inverse = self.inverse[:-1].reshape(-1)
+        return self.generalized_impulse(x) * inverse
 
     def generalized_impulse(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Generalized impulse `D x` of impulses x [N s]."""
@@ -123,14 +128,15 @@ class ActiveContacts(NamedTuple):
             row: Int[Array, ""], impulses: Float[Array, "k u"]
         ) -> Float[Array, "k u"]:
             """Impulses `sum D x` on the bodies, with those of one block of contacts."""
-            bodies, directions = (
-                block(y, row) for y in (self.pairs.bodies, self.pairs.directions)
-            )
-            each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
+            bodies = block(self.pairs.bodies, row)
+            directions = block(self.pairs.directions, row)
+            of_directions = block(x, row)[:, :, None, None]
+            each = jnp.sum(directions * of_directions, axis=1)
             return impulses.at[bodies].add(each)
 
         start = jnp.zeros_like(self.inverse)
-        return over_blocks(self.pairs.filled, one, start)[:-1].reshape(-1)
+        with_wall = over_blocks(self.pairs.filled, one, start)
+        return with_wall[:-1].reshape(-1)
 
     def product(self, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
         """Rates `D^T M^-1 D x` [m/s] that impulses x [N s] give."""
@@ -144,13 +150,14 @@ class ActiveContacts(NamedTuple):
             row: Int[Array, ""], diagonal: Float[Array, "m b"]
         ) -> Float[Array, "m b"]:
             """Diagonal with the part of one block of contacts."""
-            bodies, directions = (
-                block(x, row) for x in (self.pairs.bodies, self.pairs.directions)
-            )
+            bodies = block(self.pairs.bodies, row)
+            directions = block(self.pairs.directions, row)
             squares = directions**2 * self.inverse[bodies][:, None]
-            return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
+            of_block = jnp.sum(squares, axis=(2, 3))
+            return with_block(diagonal, of_block, row)
 
-        start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
+        shape = self.pairs.directions.shape[:2]
+        start = jnp.zeros(shape, self.inverse.dtype)
         return over_blocks(self.pairs.filled, one, start)
 
     def warm_start(self, last: Any) -> Float[Array, "m b"]:
@@ -160,7 +167,8 @@ class ActiveContacts(NamedTuple):
         row = jnp.searchsorted(last.number, self.pairs.number)
         row = jnp.minimum(row, last.number.size - 1)
         same = self.closed & (last.number[row] == self.pairs.number)
-        return jnp.where(same[:, None], last.impulse[row], 0.0)
+        impulse = last.impulse[row]
+        return jnp.where(same[:, None], impulse, 0.0)
 
     def kept(self, x: Float[Array, "m b"]) -> PileImpulses:
         """Impulses x in the form in which `warm_start` of the next step reads them."""
@@ -203,17 +211,21 @@ def contacts_of_step(
         if not friction:
             pairs = pairs._replace(directions=pairs.directions[:, :1])
         of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
-        return ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
+        inverse = jnp.pad(of_bodies, ((0, 1), (0, 0)))
+        return ActiveContacts(pairs, inverse)
     gap, normals, tangents = system.body.directions(at, friction)
     n, m = normals.shape
     directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
     if friction:
         assert tangents is not None
-        directions = jnp.concatenate([directions, tangents.reshape(n, m, -1)], axis=2)
-    least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
+        by_contacts = tangents.reshape(n, m, -1)
+        directions = jnp.concatenate([directions, by_contacts], axis=2)
+    gap_at_end = jnp.atleast_1d(system.body.gap_function(end))
+    least = jnp.minimum(gap, gap_at_end)
     closed = ~(least > closed_below)  # NaN does not pass for open
     directions = jnp.where(closed[:, None], directions, 0.0)
-    moved = solve_mass_matrix(mass, directions.reshape(n, -1)).reshape(directions.shape)
+    columns = directions.reshape(n, -1)
+    moved = solve_mass_matrix(mass, columns).reshape(directions.shape)
     matrix = jnp.tensordot(directions, moved, axes=([0], [0]))
     return AllContacts(gap, normals, closed, directions, moved, matrix)
 

@@ -179,13 +179,12 @@ def time_stepping(
     `joint`: the law is a condition on v' that joins the problem of the step
     (`Law.joins_step`).
     """
-    start, law, times = without_derivatives(
-        (start, law, times), NotImplementedError(WHY)
-    )
-    h = (times[1] - times[0]) / substeps.astype(times.dtype)
-    problem = _StepProblem(
-        start.system, law, start.friction, h, start.closed_below, joint
-    )
+    why = NotImplementedError(WHY)
+    start, law, times = without_derivatives((start, law, times), why)
+    between = times[1] - times[0]
+    h = between / substeps.astype(times.dtype)
+    friction = start.friction
+    problem = _StepProblem(start.system, law, friction, h, start.closed_below, joint)
     first = _begin(problem, start.q, start.v, times, substeps, max_events)
     dtype = times.dtype
 
@@ -200,20 +199,21 @@ def time_stepping(
             def go() -> _Progress:
                 return _one_step(problem, progress, t + i.astype(dtype) * h)
 
-            return jax.lax.cond(progress.status == CODE["ok"], go, lambda: progress)
+            goes_on = progress.status == CODE["ok"]
+            return jax.lax.cond(goes_on, go, lambda: progress)
 
         progress = jax.lax.fori_loop(0, substeps, one, progress)
         fine = progress.status == CODE["ok"]
-        return progress, jax.tree.map(
-            lambda x: jnp.where(fine, x, jnp.nan), progress.state
-        )
+        state = jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
+        return progress, state
 
     end, later = jax.lax.scan(to_sample, first, times[:-1])
     samples = jax.tree.map(
         lambda x, rest: jnp.concatenate([x[None], rest]), first.state, later
     )
     steps = substeps * (times.shape[0] - 1)
-    status = jnp.where(end.status == CODE["ok"], end.reported, end.status)
+    ended_well = end.status == CODE["ok"]
+    status = jnp.where(ended_well, end.reported, end.status)
     return Course(samples, end.events, steps, status)
 
 
@@ -233,7 +233,8 @@ def step_of_pile(start: Start, law: Law) -> PileStep:
     problem = _StepProblem(
         start.system, law, start.friction, h, start.closed_below, joint=True
     )
-    first = _begin(problem, start.q, start.v, times, jnp.int32(1), 1)
+    one_step = jnp.int32(1)
+    first = _begin(problem, start.q, start.v, times, one_step, 1)
     setup = _set_up(problem, first, times[0])
     trial = _solve(problem, first, setup)
     state, _ = _end_state(problem, first, setup, trial)
@@ -282,7 +283,8 @@ def _begin(
     events = no_events(rows, q0, v0, m, tangents=m * max(b - 1, 1))
     status = status_at_start(system, begin, times[-1], closed_below)
     fails = (status == CODE["ok"]) & ~within_domains(law)
-    status = jnp.where(fails, CODE["law_failed"], status).astype(jnp.int32)
+    code = jnp.where(fails, CODE["law_failed"], status)
+    status = code.astype(jnp.int32)
     return _Progress(
         state=begin,
         speed=zero,
@@ -351,17 +353,18 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
     base_velocity = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
     free = _loads(system, q, state.v, middle, mass)[1]
-    q_predicted = body.moved(q, 0.5 * h * (state.v + h * free))
-    contacts = contacts_of_step(
-        system, q, middle, q_predicted, end, closed_below, mu is not None
-    )
+    v_end = state.v + h * free
+    q_predicted = body.moved(q, 0.5 * h * v_end)
+    rubs = mu is not None
+    contacts = contacts_of_step(system, q, middle, q_predicted, end, closed_below, rubs)
     before = contacts.rates(state.v - base_velocity)
     rounding = precision(dtype).accumulated
     speed = jnp.maximum(progress.speed, contacts.fastest(state.v))
     tolerance = max(PILE if is_pile(system) else FEW, rounding)
     noise = max(_ROUNDING, rounding) * speed + progress.residual_velocity
     noise += tolerance * contacts.fastest(h * free)
-    slow = noise + SLOW * h * jnp.abs(contacts.rates(free)[:, 0])
+    free_rates = jnp.abs(contacts.rates(free)[:, 0])
+    slow = noise + SLOW * h * free_rates
     strikes = contacts.closed & (before[:, 0] < -slow)
     # half of the forces before an impact, half after it: over the whole step they take
     # as much energy from the velocities as the potential gains
@@ -380,7 +383,8 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
             lambda: (impulse, law_status),
         )
     rates = before + contacts.product(impulse)
-    added = jnp.where(strikes, 0.5 * h * contacts.rates(free)[:, 0], 0.0)
+    by_loads = 0.5 * h * contacts.rates(free)[:, 0]
+    added = jnp.where(strikes, by_loads, 0.0)
     e, e_t = _coefficients(problem, strikes, dtype)
     offset, offset_for_mean = _offsets(e, e_t, rates, added)
     return _Setup(
@@ -443,9 +447,9 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         """
         force, free = _loads(system, setup.q, last.mean, setup.middle, setup.mass)
         with_loads = setup.rates + h * contacts.rates(free)  # D^T v + h D^T a
-        right_side = with_loads + jnp.where(
-            last.tries < least, setup.offset, setup.offset_for_mean
-        )
+        for_mean = last.tries < least
+        offset = jnp.where(for_mean, setup.offset, setup.offset_for_mean)
+        right_side = with_loads + offset
         solution = solve_many(
             contacts.product,
             contacts.diagonal,
@@ -460,16 +464,17 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         v = v0 + h * free + contacts.velocity_change(setup.law_impulse + x)
         after = with_loads + contacts.product(x)  # gamma' and slips
         energy = 0.5 * jnp.vdot(x, setup.rates + after)
-        adds_energy = energy > (setup.noise + solution.residual_velocity) * jnp.sum(
-            jnp.abs(x)
-        )
-        return _Trial(v, 0.5 * (v0 + v), force, solution, adds_energy, last.tries + 1)
+        rounding = setup.noise + solution.residual_velocity
+        adds_energy = energy > rounding * jnp.sum(jnp.abs(x))
+        mean = 0.5 * (v0 + v)
+        return _Trial(v, mean, force, solution, adds_energy, last.tries + 1)
 
     def goes_on(trial: _Trial) -> Bool[Array, ""]:
         """True before `least` tries, then while energy is added, up to twice as
         many.
         """
-        return (trial.tries < least) | (trial.adds_energy & (trial.tries < 2 * least))
+        may_retry = trial.tries < 2 * least
+        return (trial.tries < least) | (trial.adds_energy & may_retry)
 
     zero = 0 * setup.speed
     begin = Many(
@@ -479,7 +484,8 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         iterations=jnp.int32(0),
         inverse_step_size=progress.inverse_step_size,
     )
-    start = _Trial(v0, v0, jnp.zeros_like(v0), begin, jnp.asarray(False), jnp.int32(0))
+    no_force = jnp.zeros_like(v0)
+    start = _Trial(v0, v0, no_force, begin, jnp.asarray(False), jnp.int32(0))
     return jax.lax.while_loop(goes_on, iteration, start)
 
 
@@ -497,7 +503,9 @@ def _end_state(
     contacts = setup.contacts
     x = setup.law_impulse + trial.solution.impulse
     work = x * contacts.rates(trial.mean - setup.base_velocity)
-    energy = jnp.stack([work[:, 0], jnp.sum(work[:, 1:], axis=1)])
+    by_normal = work[:, 0]
+    by_friction = jnp.sum(work[:, 1:], axis=1)
+    energy = jnp.stack([by_normal, by_friction])
     new = state._replace(
         q=problem.system.body.moved(setup.q, 0.5 * h * trial.v),
         v=trial.v,
@@ -533,17 +541,20 @@ def _status(
     if isinstance(contacts, ActiveContacts):
         status = jnp.where(contacts.pairs.overflows, CODE["room"], status)
     # a base that is NaN shows in its work, a coefficient in that of the contacts
-    finite = jnp.all(jnp.isfinite(trial.v)) & jnp.isfinite(state.base_work)
+    finite_v = jnp.all(jnp.isfinite(trial.v))
+    finite = finite_v & jnp.isfinite(state.base_work)
     finite &= jnp.all(jnp.isfinite(state.contact_work))
     status = jnp.where(finite, status, CODE["not_finite"])
     if callable(system.mass):
-        positive_definite = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
+        finite_mass = jnp.all(jnp.isfinite(setup.mass))
+        positive_definite = definite(setup.mass) | ~finite_mass
         status = jnp.where(positive_definite, status, CODE["singular_mass"])
     if isinstance(contacts, ActiveContacts):
         velocities = trial.v.reshape(-1, contacts.inverse.shape[1])
         places = (velocities.shape[1] + 1) // 2  # 2 of 3 in a plane, 3 of 6 in space
         speeds = jnp.sum(velocities[:, :places] ** 2, axis=1)
-        coarse = problem.h * jnp.sqrt(jnp.max(speeds)) > contacts.pairs.reach
+        path = problem.h * jnp.sqrt(jnp.max(speeds))
+        coarse = path > contacts.pairs.reach
     else:
         relative = progress.state.v - setup.base_velocity
         rate = contacts.normals.T @ relative
@@ -553,9 +564,11 @@ def _status(
         # evaluations of it
         speeds = jnp.abs(contacts.normals).T @ jnp.abs(relative)
         turned = rate - progress.closing > TURN * speeds + setup.slow
-        coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
+        opens = (progress.closing < 0) & (rate > 0) & turned
+        coarse = jnp.any(struck_again | opens)
     coarse = jnp.where(coarse, CODE["coarse_step"], 0)
-    unsolved = jnp.where(trial.solution.misfit > OFF, CODE["unsolved_step"], 0)
+    off = trial.solution.misfit > OFF
+    unsolved = jnp.where(off, CODE["unsolved_step"], 0)
     reported = jnp.maximum(progress.reported, jnp.maximum(coarse, unsolved))
     return status.astype(jnp.int32), reported.astype(jnp.int32)
 
@@ -575,7 +588,8 @@ def _closing_at_start(
 
     def later(s: Float[Array, ""]) -> Float[Array, " m"]:
         """Gaps [m] after the time s at the velocity v."""
-        return gaps(system, system.body.moved(q, s * v), t + s)
+        moved = system.body.moved(q, s * v)
+        return gaps(system, moved, t + s)
 
     gap, rate = jax.jvp(later, (0 * t,), (jnp.ones_like(t),))
     return _closing(gap, rate, 0.5 * problem.h, problem.closed_below)
@@ -601,7 +615,8 @@ def _closing(
     closed_below: Float[Array, ""],
 ) -> Float[Array, " m"]:
     """Rates [m/s] of open gaps with `gap + h rate < 0`, 0 elsewhere."""
-    return jnp.where((gap > closed_below) & (gap + h * rate < 0), rate, 0.0)
+    closes = (gap > closed_below) & (gap + h * rate < 0)
+    return jnp.where(closes, rate, 0.0)
 
 
 def _recorded_impact(
@@ -661,12 +676,12 @@ def _offsets(
     Where `w >= rates`, as always in normal direction, impulses add no energy.
     """
     gamma = rates[:, 0]
-    normal = jnp.where(gamma < 0, e * (gamma + added) - added, gamma)[:, None]
+    struck = e * (gamma + added) - added
+    normal = jnp.where(gamma < 0, struck, gamma)[:, None]
     slip = rates[:, 1:]
-    return (
-        jnp.concatenate([normal, e_t[:, None] * slip], axis=1),
-        jnp.concatenate([normal, slip], axis=1),
-    )
+    at_end = jnp.concatenate([normal, e_t[:, None] * slip], axis=1)
+    for_mean = jnp.concatenate([normal, slip], axis=1)
+    return at_end, for_mean
 
 
 def _law_impulses(
@@ -682,5 +697,6 @@ def _law_impulses(
     out: Any = impact(law, scene, v, noise)
     x = out.impulse[:, None]
     if shape[1] > 1:
-        x = jnp.concatenate([x, out.tangential_impulse.reshape(shape[0], -1)], axis=1)
+        side = out.tangential_impulse.reshape(shape[0], -1)
+        x = jnp.concatenate([x, side], axis=1)
     return x, out.status

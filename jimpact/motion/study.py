@@ -40,7 +40,8 @@ _DIRECTIONS = {
 
 def run_of(table: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of `simulate` but system and law, from the table [motion]."""
-    check_keys("[motion]", table, (*MOTION, *METHOD, *OTHERS), ("q0", "v0", "t_end_s"))
+    known = (*MOTION, *METHOD, *OTHERS)
+    check_keys("[motion]", table, known, ("q0", "v0", "t_end_s"))
     arguments = arguments_of(table, MOTION)
     arguments["t_end"] = float(table.get("t_start_s", 0.0)), table["t_end_s"]
     arguments["method"] = _method(table)

@@ -110,11 +110,8 @@ class System(eqx.Module):
         gravity: Any = False,
         friction: Any = None,
     ):
-        for name, function in {
-            "force": force,
-            "potential": potential,
-            "base": base,
-        }.items():
+        functions = {"force": force, "potential": potential, "base": base}
+        for name, function in functions.items():
             if function is not None:
                 check_function(name, function)
         if not isinstance(gap_function, Body):
@@ -269,7 +266,8 @@ class HarmonicBase(eqx.Module):
 
     def __call__(self, t: Any) -> Float[Array, " d"]:
         """Displacement [m] along the line, or (x, y)."""
-        y = self.amplitude * jnp.sin(2 * jnp.pi * self.frequency * t + self.phase)
+        angle = 2 * jnp.pi * self.frequency * t + self.phase
+        y = self.amplitude * jnp.sin(angle)
         if self.direction == "line":
             return y[None]
         if self.direction == "vertical":
@@ -304,7 +302,8 @@ def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
             "tangent_function", h, "(m,), one displacement a contact", len(h) == 1
         )
     if system.force is not None:
-        force = _shape_of("force", system.force, {"q": q, "v": v, "t": t}, precision)
+        values = {"q": q, "v": v, "t": t}
+        force = _shape_of("force", system.force, values, precision)
         _check_returned("force", force, f"({n},), one per velocity", force == (n,))
     if system.potential is not None:
         energy = _shape_of("potential", system.potential, {"q": q}, precision)
@@ -356,7 +355,10 @@ def _shape_of(
             f"but it "
             f"returns {out.dtype}."
         )
-    if not whole and jnp.finfo(out.dtype).bits > jnp.finfo(precision).bits:
+    if whole:
+        return out.shape
+    bits = jnp.finfo(out.dtype).bits
+    if bits > jnp.finfo(precision).bits:
         raise TypeError(
             f"Argument `system` must compute in the precision of `q0`, {precision}, "
             f"but its "

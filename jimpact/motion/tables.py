@@ -58,7 +58,8 @@ class MotionProblem(NamedTuple):
         """State at the beginning, of rigid contacts: no work has been done."""
         zero = jnp.zeros((), self.q0.dtype)
         rest = jnp.zeros((2, self.contacts), self.q0.dtype)
-        return State(self.q0, self.v0, self.times[0], zero, zero, rest, rest[:0])
+        begin = (self.q0, self.v0, self.times[0])
+        return State(*begin, zero, zero, rest, rest[:0])
 
 
 class Course(NamedTuple):
@@ -91,13 +92,13 @@ class MotionTable(NamedTuple):
     ) -> "MotionTable":
         """The table with an event in this row; see `event_numbers` and `marks`."""
         events = put(self.events, numbers, row)
-        return self._replace(
-            events=events, marks=put(self.marks, marks.astype(jnp.int32), row)
-        )
+        new_marks = put(self.marks, marks.astype(jnp.int32), row)
+        return self._replace(events=events, marks=new_marks)
 
     def with_sample(self, state: State, row: Int[Array, ""]) -> "MotionTable":
         """The table with this state as the sample of this row."""
-        return self._replace(samples=put(self.samples, packed(state)[:, 0], row))
+        state_row = packed(state)[:, 0]
+        return self._replace(samples=put(self.samples, state_row, row))
 
 
 class MotionEnd(NamedTuple):
@@ -126,7 +127,8 @@ def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
         """
         index = jnp.arange(len(rows), dtype=count.dtype)
         there = (index < count) | (index == len(rows) - 1)
-        some = jnp.where(there[:, None], rows, jax.lax.stop_gradient(rows))
+        constant = jax.lax.stop_gradient(rows)
+        some = jnp.where(there[:, None], rows, constant)
         return some + nan_derivatives(problem, there).astype(rows.dtype)
 
     samples = known(end.table.samples, jnp.minimum(end.reached, end.smooth[0]))
@@ -150,14 +152,16 @@ def no_samples(start: State, targets: Float[Array, " S"]) -> Float[Array, "S+1 r
     discards.
     """
     row = packed(start)[:, 0]
-    return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
+    table = jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype)
+    return table.at[0].set(row)
 
 
 def nan_unless(
     known: Bool[Array, " r"], rows: Float[Array, "r w"]
 ) -> Float[Array, "r w"]:
     """Rows, NaN where not `known`; unlike with `jnp.where`, all derivatives pass."""
-    return rows + jnp.where(known, 0.0, jnp.nan).astype(rows.dtype)[:, None]
+    offset = jnp.where(known, 0.0, jnp.nan).astype(rows.dtype)
+    return rows + offset[:, None]
 
 
 def nan_derivatives(inputs: Any, known: Bool[Array, " r"]) -> Float[Array, "r 1"]:
@@ -210,9 +214,8 @@ def _weights(count: int) -> np.ndarray:
 
 def _enlarged(x: Float[Array, "*d"], chosen: Bool[Array, ""]) -> Float[Array, "*d"]:
     """`L x` where `chosen`, L = max^LARGE: the second time gives infinity, then NaN."""
-    factor = jnp.where(chosen, float(jnp.finfo(x.dtype).max) ** LARGE, 1.0).astype(
-        x.dtype
-    )
+    largest = float(jnp.finfo(x.dtype).max)
+    factor = jnp.where(chosen, largest**LARGE, 1.0).astype(x.dtype)
     return _reversed(factor * _reversed(x))  # and so is its transpose
 
 
@@ -227,7 +230,8 @@ def sampled_states(
     """States (S, ..) from S + 1 rows, NaN beyond the first `reached`; `like` has their
     shapes.
     """
-    is_reached = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
+    index = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype)
+    is_reached = index < reached
     rows = nan_unless(is_reached, samples[:-1])
     return jax.vmap(lambda row: unpacked(like, row[:, None]))(rows)
 
@@ -266,12 +270,14 @@ def recorded_events(
     """Record of the first `count` events of a table; NaN or 0 in rows that are not
     used.
     """
-    used = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
+    index = jnp.arange(len(table.events) - 1, dtype=count.dtype)
+    used = index < count
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
     rows = nan_unless(used, table.events[:-1])
     n = problem.v0.size
     m = problem.contacts
-    sizes = np.cumsum([1, problem.q0.size, n, n, m, problem.tangents, 2 * m])
+    others = (problem.q0.size, n, n, m, problem.tangents, 2 * m)
+    sizes = np.cumsum([1, *others])
     time, q, before, after, impulse, side, energy, passed = jnp.split(
         rows, sizes, axis=1
     )

@@ -99,7 +99,8 @@ def scene_at(
     """Scene of an impact at q: mass, normals, tangents; gap 0 of closed contacts, inf
     of others.
     """
-    _, normals, tangents = system.body.directions(seen_from_base(system, q, t))
+    seen = seen_from_base(system, q, t)
+    _, normals, tangents = system.body.directions(seen)
     away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
     return Scene(mass_at(system, q), normals, tangents, away)
 
@@ -131,17 +132,13 @@ def impact_jump(
     friction = jnp.zeros(m, normal.dtype)
     if scene.tangents is not None:
         tangential = out.tangential_impulse
-        friction = by_contact((scene.tangents.T @ mean) * tangential, m).sum(axis=1)
+        work = (scene.tangents.T @ mean) * tangential
+        friction = by_contact(work, m).sum(axis=1)
         push = push + scene.tangents @ tangential
     energy = jnp.stack([normal, friction])
-    return Jump(
-        out.velocity + carried,
-        out.impulse,
-        tangential,
-        energy,
-        push @ carried,
-        out.status,
-    )
+    v = out.velocity + carried
+    base_work = push @ carried
+    return Jump(v, out.impulse, tangential, energy, base_work, out.status)
 
 
 def tangent_count_of(system: System, q: Float[Array, " nq"], m: int) -> int:
@@ -226,7 +223,8 @@ def resolve(
     """
     strike = _impact_if_any(system, law, settings, state, scales, approach)
     # f' = 0
-    tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)
+    rests = jnp.abs(strike.contacts.normal.rate) <= strike.rest
+    tight = strike.closed & rests
     m = before.active.shape[0]
     stopped = jnp.zeros(m, bool)
     if settings.spatial:
@@ -239,10 +237,12 @@ def resolve(
     )
     status, code, next_approach = _status(strike, jump, choice, held)
     any_fired = jnp.any(fired.reshape(-1, m), axis=0)  # of the margins of each contact
-    taking_part = jnp.where(strike.happens, jump.impulse != 0, any_fired) | choice.parts
+    takes_part = jnp.where(strike.happens, jump.impulse != 0, any_fired)
+    taking_part = takes_part | choice.parts
     after = After(_with_jump(state, jump), jump, result.passed)
     parts = released[:m] | choice.parts
-    kind = _kind(strike.happens, strike.jams, jnp.any(result.ends), parts, fired)
+    any_ends = jnp.any(result.ends)
+    kind = _kind(strike.happens, strike.jams, any_ends, parts, fired)
     return Outcome(
         after=after,
         strikes=strike.happens,
@@ -289,7 +289,8 @@ def _fired_in_space(
     m = before.active.shape[0]
     speed = length(by_contact(strike.contacts.tangent.rate, m))
     stopped = slip_stops(settings, before, fired[m:], speed, strike.scales.speed)
-    return fired.at[m:].set(fired[m:] & (before.stick | stopped)), stopped
+    of_friction = fired[m:] & (before.stick | stopped)
+    return fired.at[m:].set(of_friction), stopped
 
 
 class _Strike(NamedTuple):
@@ -326,7 +327,8 @@ def _impact_if_any(
     scales = _largest_scales(system, settings, scales, before, state)
     rest = _rest_speed(settings, scales)
     jams = approach > 0
-    strikes = jnp.any(closed & (before.normal.rate < -rest)) | jams
+    approaches = closed & (before.normal.rate < -rest)
+    strikes = jnp.any(approaches) | jams
     jump = _jump_if(strikes, system, law, settings, state, approach, closed, scales)
     contacts = contacts_at(system, state.q, jump.v, t, settings.friction)
     return _Strike(
@@ -370,7 +372,8 @@ def _brought_slow_to_rest(
     slowly = jnp.maximum(slowly, SUPPLIED * strike.approach)
     stick = jnp.zeros(m, bool)
     if contacts.tangent is not None:
-        stick = stopped | (length(by_contact(contacts.tangent.rate, m)) <= slowly)
+        slip = length(by_contact(contacts.tangent.rate, m))
+        stick = stopped | (slip <= slowly)
 
     def resting(slow: Bool[Array, " m"]) -> _Resting:
         """Velocities after the `slow` contacts that would come back are stopped.
@@ -393,15 +396,10 @@ def _brought_slow_to_rest(
     slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
         return resting(slow)
-    nested = (
-        closed
-        & strike.happens
-        & ~strike.jams
-        & _share_bodies(contacts, closed | struck)
-    )
-    nested = nested & (
-        jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity
-    )
+    shares = _share_bodies(contacts, closed | struck)
+    faster = jnp.sqrt(settings.accumulation) * scales.gap_velocity
+    nested = closed & strike.happens & ~strike.jams & shares
+    nested = nested & (jnp.abs(gamma) <= faster)
     both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
     alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     undisturbed = _undisturbed(system, contacts, cluster, strike.t)
@@ -448,15 +446,15 @@ def _next_modes(
         held_before = jnp.tile(before.active, 2)
     released = fired & held_before & ~strike.happens
     if mu is not None:
-        choice = _with_friction(
-            contacts, mu, before, held, released, rest, _slack(strike)
-        )
+        slack = _slack(strike)
+        choice = _with_friction(contacts, mu, before, held, released, rest, slack)
         return choice, held, released
     m = held.shape[0]
     active = result.pressed | (held & result.kept_closed & ~released)
     no = jnp.asarray(False)
     modes = no_modes(m, rest.dtype)._replace(active=active)
-    return ModeChoice(modes, ~no, rest, no, jnp.zeros(m, bool)), held, released
+    none = jnp.zeros(m, bool)
+    return ModeChoice(modes, ~no, rest, no, none), held, released
 
 
 def _status(
@@ -478,15 +476,13 @@ def _status(
     if now is not None and earlier is not None:
         change = jnp.max(jnp.abs(now.rate - earlier.rate))
         if not in_space(strike.contacts):
-            next_approach = jnp.where(
-                choice.consistent, 0.0, _approach(choice, now.rate, held)
-            )
+            approach = _approach(choice, now.rate, held)
+            next_approach = jnp.where(choice.consistent, 0.0, approach)
         jammed = strike.jams & (change <= SUPPLIED * strike.approach)
         none = jammed | (~choice.consistent & (next_approach == 0))
         status = jnp.where(none, CODE["no_contact_force"], status)
-        code = jnp.where(
-            choice.several, jnp.maximum(code, CODE["several_outcomes"]), code
-        )
+        with_several = jnp.maximum(code, CODE["several_outcomes"])
+        code = jnp.where(choice.several, with_several, code)
     return status, code, next_approach
 
 
@@ -510,7 +506,8 @@ def _share_bodies(contacts: Contacts, touched: Bool[Array, " m"]) -> Bool[Array,
     w = jnp.abs(contacts.delassus[:m, :m])
     size = jnp.sqrt(jnp.diagonal(w))
     others = touched[None] & ~jnp.eye(m, dtype=bool)
-    return jnp.any(others & (w > LEAST_COUPLING * jnp.outer(size, size)), axis=1)
+    coupled = w > LEAST_COUPLING * jnp.outer(size, size)
+    return jnp.any(others & coupled, axis=1)
 
 
 def _undisturbed(
@@ -524,15 +521,20 @@ def _undisturbed(
     m = result.at_rest.shape[0]
     gap = jnp.maximum(contacts.normal.value, 0.0)
     normals = contacts.normal.gradient
-    rate = normals.T @ (result.jump.v - carried_along(system, result.jump.v, t))
-    fall = contacts.approach[:m] + contacts.delassus[:m, :m] @ result.force
+    carried = carried_along(system, result.jump.v, t)
+    rate = normals.T @ (result.jump.v - carried)
+    by_force = contacts.delassus[:m, :m] @ result.force
+    fall = contacts.approach[:m] + by_force
     square = rate * rate - 2 * fall * gap
     root = jnp.sqrt(jnp.maximum(square, 0.0))
     # time of the zero: with f' < 0 in a form without cancellation
-    later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
+    falling = jnp.where(fall < 0, -fall, 1.0)
+    later = (rate + root) / falling
     reached = quotient(2 * gap, root - rate, where=rate < 0, otherwise=later)
-    never = (square < 0) | ((rate >= 0) & (fall >= 0))
-    return jnp.all(result.at_rest | never | (reached > result.passed.time))
+    rises = (rate >= 0) & (fall >= 0)
+    never = (square < 0) | rises
+    too_late = reached > result.passed.time
+    return jnp.all(result.at_rest | never | too_late)
 
 
 def _approach(
@@ -543,9 +545,11 @@ def _approach(
 
     The share is the root of rounding, and MORE of what is left of the regularity.
     """
-    left = jnp.clip(choice.regularity, 0.0, 2 * precision(slip.dtype).root)
+    most = 2 * precision(slip.dtype).root
+    left = jnp.clip(choice.regularity, 0.0, most)
     share = precision(slip.dtype).root + MORE * left
-    return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
+    fastest = jnp.max(jnp.where(held, jnp.abs(slip), 0.0))
+    return jax.lax.stop_gradient(share * fastest)
 
 
 def velocity_noise(
@@ -626,19 +630,21 @@ def _largest_scales(
     """
     m = contacts.normal.rate.shape[0]
     relative = state.v - carried_along(system, state.v, state.t)
-    energy = jnp.maximum(
-        kinetic(system, state.q, state.v), kinetic(system, state.q, relative)
-    )
+    total = kinetic(system, state.q, state.v)
+    energy = jnp.maximum(total, kinetic(system, state.q, relative))
     speed = speed_of(energy, jnp.diagonal(contacts.delassus))
     # the terms of an acceleration may cancel: what bodies side by side leave of it is
     # rounding, and so is what does not change the speed within the motion
-    terms = jnp.abs(contacts.directions[:, :m]).T @ jnp.abs(contacts.free)
-    acceleration = jnp.maximum(jnp.abs(contacts.approach[:m]), terms).max()
+    normals = jnp.abs(contacts.directions[:, :m])
+    terms = normals.T @ jnp.abs(contacts.free)
+    approach = jnp.abs(contacts.approach[:m])
+    acceleration = jnp.maximum(approach, terms).max()
     acceleration = jnp.maximum(acceleration, speed / settings.duration)
     at_rest = jnp.sqrt(acceleration * settings.closed_below)
     fastest = jnp.abs(contacts.normal.rate).max()
     now = Scales(fastest, jnp.maximum(speed, at_rest), acceleration)
-    return jax.lax.stop_gradient(jax.tree.map(jnp.maximum, scales, now))
+    largest = jax.tree.map(jnp.maximum, scales, now)
+    return jax.lax.stop_gradient(largest)
 
 
 class _Stop(NamedTuple):
@@ -666,22 +672,27 @@ def _brought_to_rest(
     before.
     """
     m = held.shape[0]
-    modes = no_modes(m, jump.v.dtype)._replace(active=held, stick=stick)
+    open_modes = no_modes(m, jump.v.dtype)
+    modes = open_modes._replace(active=held, stick=stick)
     rates = contacts.normal.rate
     if contacts.tangent is not None:
         rates = jnp.concatenate([rates, contacts.tangent.rate])
     size = rates.shape[0]
-    columns = jnp.stack([rates, contacts.approach[:size]], axis=1)
+    approach = contacts.approach[:size]
+    columns = jnp.stack([rates, approach], axis=1)
     p, force = constraint_impulse(contacts, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
     work = 0.5 * p * rates
     tangential = jnp.zeros_like(jump.tangential)
-    energy = jnp.stack([work[:m], jnp.zeros_like(work[:m])])
+    by_normal = work[:m]
+    energy = jnp.stack([by_normal, jnp.zeros_like(by_normal)])
     if contacts.tangent is not None:
-        energy = energy.at[1].set(by_contact(work[m:], m).sum(axis=1))
+        by_friction = by_contact(work[m:], m).sum(axis=1)
+        energy = energy.at[1].set(by_friction)
         tangential = p[m:]
     # the gaps, up to `closed_below`, are closed by the flight that follows
-    fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * contacts.normal.value, 0.0)
+    lost = jnp.maximum(force[:m], 0.0) * contacts.normal.value
+    fallen = jnp.where(held, lost, 0.0)
     carried = carried_along(system, jump.v, t)
     jump = jump._replace(
         v=jump.v + contacts.moved @ p,
@@ -690,7 +701,8 @@ def _brought_to_rest(
         energy=(jump.energy + energy).at[0].add(-fallen),
         base_work=jump.base_work + (contacts.directions @ p) @ carried,
     )
-    return _Stop(jump, p, force[:m], -jnp.sum(work))
+    energy_before = -jnp.sum(work)
+    return _Stop(jump, p, force[:m], energy_before)
 
 
 def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Passed:
@@ -709,12 +721,15 @@ def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Pas
     force = jnp.where(pressed, stop.force, 1.0)
     some = jnp.any(pressed) & (energy > 0)
     # energy before the last impact
-    before = jnp.where(some, energy + jnp.maximum(lost, 0), 1.0)
+    earlier = energy + jnp.maximum(lost, 0)
+    before = jnp.where(some, earlier, 1.0)
     # 1/2 where nothing is passed: not used
     r = jnp.sqrt(jnp.where(some, energy, 0.25) / before)
-    hop = jnp.max(jnp.where(pressed, 2 * jnp.abs(p) / force, 0.0))
+    duration = 2 * jnp.abs(p) / force
+    hop = jnp.max(jnp.where(pressed, duration, 0.0))
     lift = jnp.max(jnp.where(pressed, energy / force, 0.0))
-    return Passed(jnp.sum(ends.astype(p.dtype)) * hop / (1 - r), lift)
+    count = jnp.sum(ends.astype(p.dtype))
+    return Passed(count * hop / (1 - r), lift)
 
 
 def _kind(
@@ -731,8 +746,10 @@ def _kind(
     `jams`.
     """
     m = len(parts)
-    kind = jnp.where(jnp.any(fired[:m]), KIND_CODE["contact"], KIND_CODE["none"])
-    kind = jnp.where(jnp.any(fired[m:]), KIND_CODE["friction"], kind)
+    meets = jnp.any(fired[:m])
+    kind = jnp.where(meets, KIND_CODE["contact"], KIND_CODE["none"])
+    rubs = jnp.any(fired[m:])
+    kind = jnp.where(rubs, KIND_CODE["friction"], kind)
     kind = jnp.where(jnp.any(parts), KIND_CODE["detachment"], kind)
     hit = jnp.where(ends, KIND_CODE["accumulation"], KIND_CODE["impact"])
     hit = jnp.where(jams, KIND_CODE["paroxysm"], hit)

@@ -16,8 +16,7 @@ WHICH ONE
     pseudoinverse           the same, with the least forces
     singular_values,        one matrix whose rank is asked for
     eigenvectors
-    elsewhere               `sparse.conjugate_gradients` for packings,
-                            `tridiagonal.py` for chains
+    elsewhere               `sparse.conjugate_gradients` for packings
 
 LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in
 batches, loops of our own do, up to `_BY_LOOP` rows.
@@ -79,9 +78,9 @@ _NEWTON_SCHULZ = 3
 
 def unit(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n ..."]:
     """The unit matrix, with an axis of length 1 for each batch axis of the matrix."""
-    return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
-        *matrix.shape[:2], *[1] * (matrix.ndim - 2)
-    )
+    axes_of_batch = [1] * (matrix.ndim - 2)
+    identity = jnp.eye(len(matrix), dtype=matrix.dtype)
+    return identity.reshape(*matrix.shape[:2], *axes_of_batch)
 
 
 def times(
@@ -94,7 +93,8 @@ def times(
         return matrix @ vector
     if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
         return jnp.sum(matrix * vector[None], axis=1)
-    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
+    count = matrix.shape[1]
+    columns = [matrix[:, j] * vector[j : j + 1] for j in range(count)]
     return functools.reduce(jnp.add, columns)
 
 
@@ -105,10 +105,10 @@ def product(
     B.
     """
     if a.shape[1] > COLUMNS_WRITTEN_OUT:
-        return jnp.sum(a[:, :, None] * b[None], axis=1)
-    return functools.reduce(
-        jnp.add, [a[:, j, None] * b[j][None] for j in range(a.shape[1])]
-    )
+        terms = a[:, :, None] * b[None]
+        return jnp.sum(terms, axis=1)
+    rank_one = [a[:, j, None] * b[j][None] for j in range(a.shape[1])]
+    return functools.reduce(jnp.add, rank_one)
 
 
 # ---- elimination
@@ -140,7 +140,8 @@ def _eliminated(
     pivot.
     """
     n = len(matrix)
-    number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
+    axes_of_batch = [1] * (matrix.ndim - 2)
+    number = jnp.arange(n).reshape(n, 1, *axes_of_batch)
 
     def eliminate(
         k: Int[Array, ""] | int, rows: Float[Array, "n w *B"]
@@ -153,7 +154,8 @@ def _eliminated(
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
         return jnp.where(number == k, row, rows - factor * row)
 
-    return fori_loop(0, n, eliminate, jnp.concatenate([matrix, right], axis=1))[:, n:]
+    both = jnp.concatenate([matrix, right], axis=1)
+    return fori_loop(0, n, eliminate, both)[:, n:]
 
 
 def _solve_two(
@@ -165,7 +167,8 @@ def _solve_two(
     factor = matrix[1, :1]
     above = matrix[0, 1:] * scale
     x = right[0] * scale
-    last = (right[1] - factor * x) * (1 / (matrix[1, 1:] - factor * above))
+    last_pivot = matrix[1, 1:] - factor * above
+    last = (right[1] - factor * x) * (1 / last_pivot)
     return jnp.stack([x - above * last, last])
 
 
@@ -174,7 +177,8 @@ def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
     n = len(matrix)
     if n <= 2:
         return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
-    number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
+    axes_of_batch = [1] * (matrix.ndim - 2)
+    number = jnp.arange(n).reshape(n, 1, *axes_of_batch)
 
     def eliminate(
         k: Int[Array, ""] | int, rows: Float[Array, "n n *B"]
@@ -189,7 +193,8 @@ def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
         row = jnp.where(in_column, scale, row * scale)
-        return jnp.where(in_row, row, jnp.where(in_column, 0.0, rows) - column * row)
+        others = jnp.where(in_column, 0.0, rows)
+        return jnp.where(in_row, row, others - column * row)
 
     return fori_loop(0, n, eliminate, matrix)
 
@@ -203,7 +208,8 @@ def solve_definite(
     """
     if len(g) > _BY_LOOP:
         return jnp.linalg.solve(g, right)
-    return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
+    columns = right.reshape(len(g), -1, 1)
+    return solve(g[..., None], columns).reshape(right.shape)
 
 
 @jax.jit
@@ -216,7 +222,8 @@ def solve_mass_matrix(
     NaN where M is a matrix that is not positive definite.
     """
     if mass.ndim == 1:
-        return right / mass.reshape(-1, *[1] * (right.ndim - 1))
+        axes_of_columns = [1] * (right.ndim - 1)
+        return right / mass.reshape(-1, *axes_of_columns)
     if len(mass) > _BY_LOOP:
         return jax.scipy.linalg.solve(mass, right, assume_a="pos")
     columns = right.reshape(len(mass), -1, 1)
@@ -235,7 +242,8 @@ def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"
     """
     perturbation = precision(matrix.dtype).eps ** (2 / 3)
     m = len(matrix)
-    eye = jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
+    b = matrix.shape[1]
+    eye = jnp.eye(b, dtype=matrix.dtype)[..., None]
 
     def eliminate(
         i: Int[Array, ""] | int, inverse: Float[Array, "m b m b N"]
@@ -249,12 +257,15 @@ def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"
         row = inverse[i]
         block = _small_inverse(column[i], perturbation)
         column = jnp.where(pivot, -eye[None], column)
-        row = jnp.where(pivot[:, 0][None], eye[:, None], row)
-        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)  # block times row
+        in_column = pivot[:, 0][None]
+        row = jnp.where(in_column, eye[:, None], row)
+        terms = block[:, :, None, None] * row[None]
+        row = jnp.sum(terms, axis=1)  # block times row
         # row i and column i of blocks
         replaced = pivot[..., None] | pivot[None, None, :, 0]
         # column times row
-        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        terms = column[:, :, :, None, None] * row[None, None]
+        spread = jnp.sum(terms, axis=2)
         return jnp.where(replaced, 0.0, inverse) - spread
 
     return fori_loop(0, m, eliminate, matrix)
@@ -269,10 +280,12 @@ def block_solve(
     """
     m, b = matrix.shape[:2]
     if m * b > _BLOCKS:
-        flat = matrix.reshape(m * b, m * b), right.reshape(m * b, -1)
+        square = matrix.reshape(m * b, m * b)
+        flat = square, right.reshape(m * b, -1)
         return jnp.linalg.solve(*flat).reshape(right.shape)
     perturbation = precision(matrix.dtype).eps ** 2  # of a block that is singular
-    rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
+    flat_rows = matrix.reshape(m, b, m * b)
+    rows = jnp.concatenate([flat_rows, right], axis=2)
 
     def eliminate(
         i: Int[Array, ""] | int, rows: Float[Array, "m b w"]
@@ -295,15 +308,19 @@ def _small_inverse(
     singular.
     """
     singular = jnp.abs(_small_determinant(block)) < perturbation
-    eye = jnp.eye(len(block), dtype=block.dtype)[..., None]
-    block = block + jnp.where(singular, perturbation, 0.0)[None, None] * eye
+    b = len(block)
+    eye = jnp.eye(b, dtype=block.dtype)[..., None]
+    shift = jnp.where(singular, perturbation, 0.0)
+    block = block + shift[None, None] * eye
     determinant = _small_determinant(block)
-    return _cofactors(block) / jnp.where(determinant == 0, 1.0, determinant)[None, None]
+    divisor = jnp.where(determinant == 0, 1.0, determinant)
+    return _cofactors(block) / divisor[None, None]
 
 
 def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, " N"]:
     """Determinants of blocks, b = 2 or 3: the first row times its cofactors."""
-    return jnp.sum(a[0] * _cofactors(a)[:, 0], axis=0)
+    cofactors = _cofactors(a)[:, 0]
+    return jnp.sum(a[0] * cofactors, axis=0)
 
 
 def _cofactors(a: Float[Array, "b b N"]) -> Float[Array, "b b N"]:
@@ -311,10 +328,11 @@ def _cofactors(a: Float[Array, "b b N"]) -> Float[Array, "b b N"]:
     products.
     """
     if len(a) == 2:
-        return jnp.stack(
-            [jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])]
-        )
-    sides = [jnp.cross(a[i], a[j], axis=0) for i, j in ((1, 2), (2, 0), (0, 1))]
+        first = jnp.stack([a[1, 1], -a[0, 1]])
+        second = jnp.stack([-a[1, 0], a[0, 0]])
+        return jnp.stack([first, second])
+    cyclic = ((1, 2), (2, 0), (0, 1))
+    sides = [jnp.cross(a[i], a[j], axis=0) for i, j in cyclic]
     return jnp.stack(sides, axis=1)
 
 
@@ -338,9 +356,11 @@ def solve_by_pivots(
         """
         rows, determinant = state
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
-        largest = jnp.argmax(jnp.where(number >= k, jnp.abs(column), -1.0), axis=0)[0]
+        size = jnp.where(number >= k, jnp.abs(column), -1.0)
+        largest = jnp.argmax(size, axis=0)[0]
         # the rows k and `largest` change places
-        own, chosen = (jax.lax.dynamic_index_in_dim(rows, i, 0) for i in (k, largest))
+        row_of = functools.partial(jax.lax.dynamic_index_in_dim, rows, axis=0)
+        own, chosen = (row_of(i) for i in (k, largest))
         pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
         rows = jnp.where(number == largest, own, rows)
         row = chosen / pivot
@@ -370,9 +390,12 @@ def determinants(k: Float[Array, "N n n"]) -> Float[Array, " N"]:
     a = k[..., left]
     b = k[..., right]
     # of rows 1 and 2, of 3 and 4
-    minors = a[:, ::2] * b[:, 1::2] - b[:, ::2] * a[:, 1::2]
-    signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
-    return jnp.sum(minors[:, 0] * minors[:, 1, ::-1] * signs[None], axis=-1)
+    products = a[:, ::2] * b[:, 1::2]
+    minors = products - b[:, ::2] * a[:, 1::2]
+    odd = (left + right) % 2
+    signs = jnp.asarray(np.where(odd, 1, -1), k.dtype)
+    opposite = minors[:, 1, ::-1]
+    return jnp.sum(minors[:, 0] * opposite * signs[None], axis=-1)
 
 
 # ---- singular matrices: redundant contacts
@@ -386,7 +409,8 @@ def load_shares(
 
     None is below `least`, which keeps the weights of contacts without load regular.
     """
-    largest = jax.lax.stop_gradient(jnp.max(limit, axis=0, keepdims=True))
+    most = jnp.max(limit, axis=0, keepdims=True)
+    largest = jax.lax.stop_gradient(most)
     share = limit / jnp.where(largest > 0, largest, 1.0)
     if least > 0:
         return jnp.maximum(share, least)
@@ -471,10 +495,13 @@ def pseudoinverse(
     """
     both = held[:, None] & held[None]
     k = jnp.where(both, matrix, 0.0)
-    size = jnp.max(jnp.abs(k), axis=(0, 1), keepdims=True)
+    entries = jnp.abs(k)
+    size = jnp.max(entries, axis=(0, 1), keepdims=True)
     eps = float(jnp.finfo(k.dtype).eps)
-    part = _NEGLIGIBLE_PART * math.sqrt(eps) * jnp.where(size > 0, size, 1.0)
-    damped = inverse(k + unit(k) * jnp.where(held[:, None], part, 1.0))
+    positive = jnp.where(size > 0, size, 1.0)
+    part = _NEGLIGIBLE_PART * math.sqrt(eps) * positive
+    ridge = jnp.where(held[:, None], part, 1.0)
+    damped = inverse(k + unit(k) * ridge)
     z = product(damped, product(k, damped))
     for _ in range(_NEWTON_SCHULZ):
         z = 2 * z - product(z, product(k, z))
@@ -499,7 +526,8 @@ def _are_null(values: Float[Array, "n *N"]) -> Bool[Array, "n *N"]:
     """Mask of singular values that are rounding: `<= precision.singular n` times the
     largest.
     """
-    return values <= precision(values.dtype).singular * len(values) * values[:1]
+    rounding = precision(values.dtype).singular * len(values)
+    return values <= rounding * values[:1]
 
 
 @jax.custom_batching.custom_vmap
@@ -531,7 +559,8 @@ def _batch_of_singular_values(
         lambda: left,
     )
     parts = left, values, right.swapaxes(0, 1), null
-    return SingularValues(*(jnp.moveaxis(x, -1, 0) for x in parts)), all_batched
+    in_front = (jnp.moveaxis(x, -1, 0) for x in parts)
+    return SingularValues(*in_front), all_batched
 
 
 @jax.custom_batching.custom_vmap
@@ -556,7 +585,8 @@ def _batch_of_eigenvectors(
         values, vectors = jnp.linalg.eigh(matrices)
         return (values, vectors), (True, True)
     _, vectors, values = _orthogonal(jnp.moveaxis(matrices, 0, -1))
-    return (values.T, jnp.moveaxis(vectors, -1, 0)), (True, True)
+    in_front = jnp.moveaxis(vectors, -1, 0)
+    return (values.T, in_front), (True, True)
 
 
 def _orthogonal(
@@ -574,8 +604,10 @@ def _orthogonal(
     n = len(matrix)
     # an odd number of columns: one of zeros, which no rotation changes
     places = n + n % 2
-    both = jnp.concatenate([matrix, jnp.broadcast_to(unit(matrix), matrix.shape)])
-    both = jnp.pad(both, ((0, 0), (0, places - n), (0, 0)))
+    identity = jnp.broadcast_to(unit(matrix), matrix.shape)
+    both = jnp.concatenate([matrix, identity])
+    missing = (0, places - n)
+    both = jnp.pad(both, ((0, 0), missing, (0, 0)))
 
     class Sweep(NamedTuple):
         """Columns of [A V; V] in two rows, the largest cos^2 between two of A V, sweeps
@@ -595,13 +627,15 @@ def _orthogonal(
         `t^2 + (|y|^2 - |x|^2) / (x . y) t = 1`.
         """
         x, y, largest, done = at
-        product = jnp.sum(x[:n] * y[:n], axis=0, keepdims=True)
+        terms = x[:n] * y[:n]
+        product = jnp.sum(terms, axis=0, keepdims=True)
         squares = [
             jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)
         ]
         half = (squares[1] - squares[0]) / 2
         real = jnp.minimum(*squares) > (rounding**2) * whole  # other columns are 0
-        angle = quotient(product**2, squares[0] * squares[1], where=real)
+        of_both = squares[0] * squares[1]
+        angle = quotient(product**2, of_both, where=real)
         root = jnp.sqrt(half**2 + product**2)
         longer = jnp.where(half >= 0, half + root, half - root)
         slope = product / jnp.where(longer != 0, longer, 1.0)
@@ -611,10 +645,10 @@ def _orthogonal(
         largest = jnp.maximum(largest, jnp.max(angle))
         if places == 2:
             return Sweep(x, y, largest, done)
-        first = jnp.concatenate([x[:, :1], y[:, :1], x[:, 1:-1]], axis=1)
-        return Sweep(
-            first, jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1), largest, done
-        )
+        kept_places = x[:, 1:-1]
+        first = jnp.concatenate([x[:, :1], y[:, :1], kept_places], axis=1)
+        partners = jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1)
+        return Sweep(first, partners, largest, done)
 
     def sweep(at: Sweep) -> Sweep:
         """State after a sweep: as many rounds as make each column meet each other
@@ -625,17 +659,29 @@ def _orthogonal(
         return end._replace(done=at.done + 1)
 
     rounding = n * precision(matrix.dtype).eps
-    whole = jnp.sum(matrix**2, axis=(0, 1), keepdims=True)
+    entries_squared = matrix**2
+    whole = jnp.sum(entries_squared, axis=(0, 1), keepdims=True)
     first, second = jnp.split(both, 2, axis=1)
-    start = Sweep(first, second, jnp.ones((), matrix.dtype), jnp.int32(0))
+    one = jnp.ones((), matrix.dtype)
+    start = Sweep(first, second, one, jnp.int32(0))
     end = while_loop(
         lambda at: (at.cosine > rounding**2) & (at.done < _JACOBI_SWEEPS), sweep, start
     )
-    both = jnp.concatenate([end.first, end.second], axis=1)[:, :n]
-    length = jnp.sqrt(jnp.sum(both[:n] ** 2, axis=0))
+    with_padding = jnp.concatenate([end.first, end.second], axis=1)
+    both = with_padding[:, :n]
+    return _by_falling_length(both[:n], both[n:])
+
+
+def _by_falling_length(
+    images: Float[Array, "n n B"], vectors: Float[Array, "n n B"]
+) -> tuple[Float[Array, "n n B"], Float[Array, "n n B"], Float[Array, "n B"]]:
+    """Columns of A V and of V in the order of the falling lengths of A V, and these."""
+    length = jnp.sqrt(jnp.sum(images**2, axis=0))
     order = jnp.argsort(-length, axis=0)
-    both = jnp.take_along_axis(both, order[None], axis=1)
-    return both[:n], both[n:], jnp.take_along_axis(length, order, axis=0)
+    ordered_images = jnp.take_along_axis(images, order[None], axis=1)
+    ordered_vectors = jnp.take_along_axis(vectors, order[None], axis=1)
+    falling = jnp.take_along_axis(length, order, axis=0)
+    return ordered_images, ordered_vectors, falling
 
 
 def null_projector(
@@ -667,5 +713,6 @@ def solve_symmetric(
     projector, singular = null_projector(g)
     x = solve_definite(g + projector, right)
     residual = jnp.abs(g @ x - right).max()
-    missed = residual > precision(g.dtype).root * jnp.abs(right).max()
+    largest = jnp.abs(right).max()
+    missed = residual > precision(g.dtype).root * largest
     return x, singular, singular & missed

@@ -96,7 +96,8 @@ def in_lanes(
     differentiated. One that `queues` gets larger chunks of a large batch: there impacts
     that are over make room for others.
     """
-    arrays = tuple(varying_like([jnp.asarray(x) for x in arrays], arrays))
+    inputs = [jnp.asarray(x) for x in arrays]
+    arrays = tuple(varying_like(inputs, arrays))
     if adjoint == "checkpoints":
         return _reversible(function, fine)(*arrays)
     return _differentiable_lanes(function, fine, adjoint)(*arrays)
@@ -130,16 +131,16 @@ def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
         """The leaves of the result, from the arrays in the argument."""
         values = iter(arrays)
         rebuilt = [next(values) if x is None else x for x in others]
-        results, result_tree = jax.tree.flatten(
-            function(jax.tree.unflatten(tree, rebuilt))
-        )
+        outcome = function(jax.tree.unflatten(tree, rebuilt))
+        results, result_tree = jax.tree.flatten(outcome)
         trees[:] = [result_tree]
         return tuple(results)
 
     wide = _OneLane(of_arrays)
     lanes = (x[..., None] for x, other in zip(leaves, others) if other is None)
     results = _as_it_is(wide, wide, "jacobian")(*lanes)
-    return jax.tree.unflatten(trees[0], [x[..., 0] for x in results])
+    alone = [x[..., 0] for x in results]
+    return jax.tree.unflatten(trees[0], alone)
 
 
 def without_derivatives(values: Any, why: Exception) -> Any:
@@ -162,8 +163,10 @@ def without_derivatives(values: Any, why: Exception) -> Any:
     same.defjvp(rule, symbolic_zeros=True)
     leaves, tree = jax.tree.flatten(values)
     moving = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
-    replaced = dict(zip(moving, same([leaves[i] for i in moving])))
-    return jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
+    same_values = same([leaves[i] for i in moving])
+    replaced = dict(zip(moving, same_values))
+    new_leaves = [replaced.get(i, x) for i, x in enumerate(leaves)]
+    return jax.tree.unflatten(tree, new_leaves)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +177,8 @@ class _OneLane:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         """Results (.., 1) of the function, from arrays (.., 1)."""
-        return tuple(x[..., None] for x in self.function(*(x[..., 0] for x in arrays)))
+        alone = (x[..., 0] for x in arrays)
+        return tuple(x[..., None] for x in self.function(*alone))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,9 +235,8 @@ class _WithJacobian:
 
     def results(self, *kinds: Kind) -> Iterator[Kind]:
         """Kinds of the results of the function, then of the rates."""
-        count = sum(
-            math.prod(kind.shape) for kind, mark in zip(kinds, self.marked) if mark
-        )
+        moving = [kind for kind, mark in zip(kinds, self.marked) if mark]
+        count = sum(math.prod(kind.shape) for kind in moving)
         return _with_rates(results_of(self.function, *kinds), (count,))
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
@@ -245,7 +248,8 @@ class _WithJacobian:
         sizes = [math.prod(x.shape[:-1]) for x in moving]
         count = -(-sum(sizes) // DIRECTIONS)  # runs, rounded up
         size = -(-sum(sizes) // count)  # directions of a run
-        unit = jnp.eye(count * size, sum(sizes), dtype=moving[0].dtype)
+        dtype = moving[0].dtype
+        unit = jnp.eye(count * size, sum(sizes), dtype=dtype)
 
         def along(rows: Float[Array, "d D"]) -> tuple[Arrays, Arrays]:
             """Results, and rates (d, .., B) in d directions, given by entries in all
@@ -254,7 +258,8 @@ class _WithJacobian:
             directions = []
             first = 0
             for x, n in zip(moving, sizes):  # entries first .. first + n are those of x
-                own = rows[:, first : first + n].reshape(len(rows), *x.shape[:-1], 1)
+                entries = rows[:, first : first + n]
+                own = entries.reshape(len(rows), *x.shape[:-1], 1)
                 own = jnp.broadcast_to(own, (len(rows), *x.shape))
                 directions.append(varying_like(own, x))
                 first += n
@@ -265,8 +270,10 @@ class _WithJacobian:
         if count == 1:
             outs, rates = along(unit)
             return *outs, *rates
-        outs, rates = jax.lax.map(along, unit.reshape(count, size, -1))
-        joined = (jnp.concatenate(x)[: sum(sizes)] for x in rates)
+        runs = unit.reshape(count, size, -1)
+        outs, rates = jax.lax.map(along, runs)
+        whole = sum(sizes)
+        joined = (jnp.concatenate(x)[:whole] for x in rates)
         return *(x[0] for x in outs), *joined
 
 
@@ -275,9 +282,9 @@ def _with_rates(results: tuple[Kind, ...], many: tuple[int, ...]) -> Iterator[Ki
     front.
     """
     yield from results
-    yield from (
-        kind._replace(shape=(*many, *kind.shape)) for kind in results if kind.smooth
-    )
+    for kind in results:
+        if kind.smooth:
+            yield kind._replace(shape=(*many, *kind.shape))
 
 
 def _count_of_values(outs: Arrays) -> int:
@@ -301,14 +308,14 @@ def _push(
     def of_marked(*values: jax.Array) -> Arrays:
         """`function` of its marked arguments, the others as they are."""
         replaced = iter(values)
-        return tuple(
-            function(*(next(replaced) if m else x for x, m in zip(arrays, marked)))
-        )
+        whole = (next(replaced) if m else x for x, m in zip(arrays, marked))
+        return tuple(function(*whole))
 
     def one(*directions: jax.Array) -> tuple[Arrays, Arrays]:
         """Results, and rates (.., B) of the smooth ones, in one direction."""
         outs, rates = jax.jvp(of_marked, moving, directions)
-        return outs, tuple(rate for x, rate in zip(outs, rates) if is_smooth(x))
+        pairs = zip(outs, rates)
+        return outs, tuple(rate for x, rate in pairs if is_smooth(x))
 
     moving = tuple(x for x, mark in zip(arrays, marked) if mark)
     return jax.vmap(one, out_axes=(None, 0))(*directions)
@@ -322,9 +329,8 @@ def _push_duals(
     duals = [Dual(x, next(inner)) if mark else x for x, mark in zip(arrays, marked)]
     outs = tuple(function(*duals))
     smooth = [dual_like(duals, x) for x in outs if is_dual(x) or is_smooth(x)]
-    return value_of(outs), tuple(
-        jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in smooth
-    )
+    rates = tuple(jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in smooth)
+    return value_of(outs), rates
 
 
 @functools.cache
@@ -383,7 +389,8 @@ def _differentiable(
             outs, rates = derivative(_WithTangents, marked, *primals, *moving)
         else:
             outs, jacobian = derivative(_WithJacobian, marked, *primals)
-            direction = jnp.concatenate([t.reshape(-1, t.shape[-1]) for t in moving])
+            flat = [t.reshape(-1, t.shape[-1]) for t in moving]
+            direction = jnp.concatenate(flat)
             rates = iter([_contracted(x, direction) for x in jacobian])
         return outs, _with_zeros(outs, rates)
 
@@ -411,10 +418,10 @@ def _second_order(
         jacobian = _WithJacobian(first.function, first.marked)
         outs = _differentiable_lanes(jacobian, jacobian, "jacobian")(*arrays[:count])
         n = _count_of_values(outs)
-        direction = jnp.concatenate(
-            [t.reshape(-1, t.shape[-1]) for t in arrays[count:]]
-        )
-        whole = *outs[:n], *(_contracted(x, direction) for x in outs[n:])
+        flat = [t.reshape(-1, t.shape[-1]) for t in arrays[count:]]
+        direction = jnp.concatenate(flat)
+        along = (_contracted(x, direction) for x in outs[n:])
+        whole = *outs[:n], *along
         return tuple(x for x in whole if is_smooth(x)), whole
 
     values = tuple(x for x, mark in zip(primals, marked) if mark)
@@ -520,9 +527,8 @@ def results_of(function: Function, *kinds: Kind) -> tuple[Kind, ...]:
     if hasattr(function, "results"):
         return tuple(function.results(*kinds))
     one = [jax.ShapeDtypeStruct((*kind.shape, 1), kind.dtype) for kind in kinds]
-    return tuple(
-        Kind(x.shape[:-1], x.dtype) for x in jax.eval_shape(_compiled(function), *one)
-    )
+    outs = jax.eval_shape(_compiled(function), *one)
+    return tuple(Kind(x.shape[:-1], x.dtype) for x in outs)
 
 
 @functools.cache
@@ -581,7 +587,8 @@ def _batching_rule(
     which computes values once.
     """
     batched = [axis is not None for axis in axes]
-    size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
+    pairs = list(zip(arrays, axes))
+    size = next(x.shape[axis] for x, axis in pairs if axis is not None)
     arrays = [
         x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes)
     ]
@@ -596,7 +603,8 @@ def _batching_rule(
             x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
             for x, is_batched in zip(arrays[count:], batched[count:])
         ]
-        outs = _lanes(dataclasses.replace(function, many=True))(*arrays[:count], *along)
+        many = dataclasses.replace(function, many=True)
+        outs = _lanes(many)(*arrays[:count], *along)
         values = _count_of_values(outs)
         return outs, tuple(None if i < values else 0 for i in range(len(outs)))
 
@@ -607,12 +615,15 @@ def _batching_rule(
         if is_batched:
             x = jnp.moveaxis(x, 0, -2)
         else:
-            x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
-        return x.reshape(*x.shape[:-2], size * x.shape[-1])
+            every_lane = (*x.shape[:-1], size, x.shape[-1])
+            x = jnp.broadcast_to(x[..., None, :], every_lane)
+        lanes = size * x.shape[-1]
+        return x.reshape(*x.shape[:-2], lanes)
 
     outs = _lanes(function)(*map(wide, arrays, batched))
     split = [x.reshape(*x.shape[:-1], size, x.shape[-1] // size) for x in outs]
-    return tuple(jnp.moveaxis(x, -2, 0) for x in split), (0,) * len(split)
+    in_front = tuple(jnp.moveaxis(x, -2, 0) for x in split)
+    return in_front, (0,) * len(split)
 
 
 batching.primitive_batchers[_lanes_p] = _batching_rule
@@ -634,21 +645,21 @@ def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
 
         def cut(x: Shaped[Array, "*rows B"]) -> Shaped[Array, "count *rows width"]:
             """Chunks of the batch, the last one filled up with its last impact."""
-            filled = jnp.pad(
-                x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge"
-            )
-            return jnp.moveaxis(filled.reshape(*x.shape[:-1], count, width), -2, 0)
+            more = (0, count * width - size)
+            filled = jnp.pad(x, [*[(0, 0)] * (x.ndim - 1), more], mode="edge")
+            chunks = filled.reshape(*x.shape[:-1], count, width)
+            return jnp.moveaxis(chunks, -2, 0)
 
         def join(x: Shaped[Array, "count *rows width"]) -> Shaped[Array, "*rows B"]:
             """The chunks side by side, without what fills up the last one: the inverse
             of `cut`.
             """
             joined = jnp.moveaxis(x, 0, -2)
-            return joined.reshape(*joined.shape[:-2], count * width)[..., :size]
+            side_by_side = joined.reshape(*joined.shape[:-2], count * width)
+            return side_by_side[..., :size]
 
-        mapped = jax.lax.map(
-            lambda piece: tuple(function(*piece)), tuple(map(cut, whole))
-        )
+        chunks = tuple(map(cut, whole))
+        mapped = jax.lax.map(lambda piece: tuple(function(*piece)), chunks)
         return tuple(map(join, mapped))
 
     return jax.lax.platform_dependent(

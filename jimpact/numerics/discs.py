@@ -21,7 +21,8 @@ def tangents_of(x: Float[Array, "m b *N"]) -> Float[Array, "m rows *N"]:
 def length_of(vectors: Float[Array, "m rows N"]) -> Float[Array, "m N"]:
     """Lengths |v|; the derivative of 0 is 0."""
     squares = jnp.sum(vectors**2, axis=1)
-    return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
+    positive = jnp.where(squares > 0, squares, 1.0)
+    return jnp.where(squares > 0, jnp.sqrt(positive), 0.0)
 
 
 def over(
@@ -39,4 +40,5 @@ def in_disc(
     """Projections on discs: the points with |v| <= radius nearest to `side`."""
     length = length_of(side)
     outside = (length > radius)[:, None]
-    return jnp.where(outside, over(side, length) * radius[:, None], side)
+    on_rim = over(side, length) * radius[:, None]
+    return jnp.where(outside, on_rim, side)

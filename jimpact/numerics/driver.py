@@ -3,6 +3,7 @@ one.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import equinox.internal as eqxi
@@ -97,7 +98,8 @@ def _in_slots(
 
     def picked(tree: Any, impact: Int[Array, " slots"]) -> Any:
         """The columns of these impacts in all arrays (.., B) of the tree."""
-        return jax.tree.map(lambda x: jnp.take(x, impact, axis=-1, mode="clip"), tree)
+        taken = partial(jnp.take, indices=impact, axis=-1, mode="clip")
+        return jax.tree.map(taken, tree)
 
     def stored(s: _Slots) -> Any:
         """The states of all impacts, those in slots as they are now."""
@@ -127,7 +129,8 @@ def _in_slots(
             """True while too few slots are free to fill them, or some are busy at the
             end.
             """
-            busy = jnp.sum(goes_on(s.flow, carry), dtype=jnp.int32)
+            going = goes_on(s.flow, carry)
+            busy = jnp.sum(going, dtype=jnp.int32)
             return busy > jnp.where(s.following < count, size - most_free, 0)
 
         carry = while_loop(continues, lambda carry: advance(s.flow, carry), s.carry)
@@ -135,10 +138,12 @@ def _in_slots(
 
     def open_work(s: _Slots) -> Bool[Array, ""]:
         """True while an impact goes on or waits."""
-        return jnp.any(goes_on(s.flow, s.carry)) | (s.following < count)
+        going = goes_on(s.flow, s.carry)
+        return jnp.any(going) | (s.following < count)
 
     impact = jnp.arange(size, dtype=jnp.int32)
     following = jnp.asarray(size, jnp.int32)
-    flow_of_slots, carry_of_slots = jax.tree.map(lambda x: x[..., :size], (flow, carry))
+    both = (flow, carry)
+    flow_of_slots, carry_of_slots = jax.tree.map(lambda x: x[..., :size], both)
     slots = _Slots(impact, following, flow_of_slots, carry_of_slots, carry)
     return while_loop(open_work, next_round, slots).ends

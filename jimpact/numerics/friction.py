@@ -185,39 +185,18 @@ def solve(
     """
     m = len(normal)
     rows = len(slip) // m
-    # rows of A (m, b) of each contact: its normal, then its tangents
-    order = np.concatenate(
-        [np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1
-    )
-    of_contacts = matrix[order[:, :, None, None], order[None, None]]
-    # unknowns are scaled to a diagonal of 1, both tangents of a contact alike
-    squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
-    of_tangents = jnp.mean(tangents_of(squares), axis=1)
-    squares = jnp.stack([squares[:, 0], of_tangents], axis=1)
-    norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
-    repeats = np.array([1, rows])
-    scale = 1 / jnp.repeat(norm, repeats, axis=1, total_repeat_length=1 + rows)
-    rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
-    friction = friction * norm[:, -1] / norm[:, 0]
-    of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
+    scaled = _by_contact(matrix, normal, slip, friction)
+    scale = scaled.scale
     drag = jnp.zeros((m, rows), matrix.dtype)  # p_t / p of contacts whose slip is known
-    # their p_t = drag p moves into the column of p; unit rows of p_t
     if sliding is not None:
-        slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
-        drag = -friction[:, None] * sliding.reshape(m, rows)
-        dragged = jnp.sum(_of_tangents(of_contacts) * drag[None, None], axis=3)
-        of_contacts = of_contacts.at[..., 0].add(dragged)
-        decoupled = jnp.pad(jnp.repeat(slides[:, None], rows, axis=1), ((0, 0), (1, 0)))
-        apart = decoupled[:, :, None, None] | decoupled[None, None]
-        unit = jnp.eye(rate.size, dtype=matrix.dtype).reshape(of_contacts.shape)
-        of_contacts = jnp.where(apart, unit, of_contacts)
-        rate = jnp.where(decoupled, 0.0, rate)
-        friction = jnp.where(slides, 0.0, friction)
-    largest = jax.lax.stop_gradient(jnp.abs(rate).max())
+        directions = sliding.reshape(m, rows)
+        drag = -scaled.friction[:, None] * directions
+        scaled = _with_known_slip(scaled, directions, drag)
+    largest = jax.lax.stop_gradient(jnp.abs(scaled.rate).max())
     size = jnp.where(largest > 0, largest, 1.0)
     if load is not None:
-        load = load * norm[:, 0] / size
-    numbers = (of_contacts, rate / size, friction, load)
+        load = load * scaled.norm / size
+    numbers = (scaled.matrix, scaled.rate / size, scaled.friction, load)
     problem = _FrictionProblem(*numbers, complementary)
     fixed = _FrictionProblem(*jax.lax.stop_gradient(numbers), complementary)
     decision = (_enumerate if m <= ENUMERATED else _search)(fixed)
@@ -226,23 +205,26 @@ def solve(
     free, code = _freedom(fixed, inverted)
     status = jnp.maximum(decision.status, code)
     x = _on_modes(problem, modes, inverted, decided)
-    missed = _misfit(
-        fixed, jax.lax.stop_gradient(x)[..., None], _size(decided[..., None])
-    )[0]
+    constant = jax.lax.stop_gradient(x)
+    (missed,) = _misfit(fixed, constant[..., None], _size(decided[..., None]))
     wrong = ~(missed <= fixed.tolerance)
-    status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
+    unsolved = wrong & (status < CODE["infeasible"])
+    status = jnp.where(unsolved, CODE["max_steps"], status)
     dragged = tangents_of(x) + drag * normals_of(x)
-    x = jnp.concatenate([normals_of(x), dragged], axis=1) * scale * size
+    both = jnp.concatenate([normals_of(x), dragged], axis=1)
+    x = both * scale * size
     p = x[:, 0]
     if complementary:
         p = jnp.where(p < 0, 0.0, p)  # rounding
-    free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
+    units_of_rows = jax.lax.stop_gradient(scale)[..., None]
+    free = units_of_rows * free.reshape(*scale.shape, -1)
     free = _normals_first(free)
     shares = None
     if decision.others is not None:
         units = jax.lax.stop_gradient(scale * size)[..., None]
         shares = _normals_first(units * decision.others).T
-    return FrictionImpulses(p, tangents_of(x).reshape(-1), status, free, shares)
+    p_t = tangents_of(x).reshape(-1)
+    return FrictionImpulses(p, p_t, status, free, shares)
 
 
 class _Decision(NamedTuple):
@@ -255,11 +237,76 @@ class _Decision(NamedTuple):
     others: Float[Array, "m b s"] | None
 
 
+class _ByContact(NamedTuple):
+    """The problem by contacts, in unknowns `x / scale`: A has a diagonal of 1."""
+
+    matrix: Float[Array, "m b m b"]
+    rate: Float[Array, "m b"]
+    friction: Float[Array, " m"]
+    norm: Float[Array, " m"]  # 1 / scale of the normal impulses
+    scale: Float[Array, "m b"]
+
+
+def _by_contact(
+    matrix: Float[Array, "n n"],
+    normal: Float[Array, " m"],
+    slip: Float[Array, " t"],
+    friction: Float[Array, " m"],
+) -> _ByContact:
+    """The problem of `solve` with the rows of each contact together: its normal, then
+    its tangents, which are scaled alike.
+    """
+    m = len(normal)
+    rows = len(slip) // m
+    tangents = m + np.arange(m * rows).reshape(m, rows)
+    order = np.concatenate([np.arange(m)[:, None], tangents], 1)
+    of_contacts = matrix[order[:, :, None, None], order[None, None]]
+    squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
+    of_tangents = jnp.mean(tangents_of(squares), axis=1)
+    of_normals = squares[:, 0]
+    squares = jnp.stack([of_normals, of_tangents], axis=1)
+    norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
+    repeats = np.array([1, rows])
+    entries = 1 + rows
+    scale = 1 / jnp.repeat(norm, repeats, axis=1, total_repeat_length=entries)
+    slip_rows = slip.reshape(m, rows)
+    rate = jnp.concatenate([normal[:, None], slip_rows], axis=1) * scale
+    scaled_friction = friction * norm[:, -1] / norm[:, 0]
+    scaled_rows = of_contacts * scale[:, :, None, None]
+    scaled_matrix = scaled_rows * scale[None, None]
+    return _ByContact(scaled_matrix, rate, scaled_friction, norm[:, 0], scale)
+
+
+def _with_known_slip(
+    given: _ByContact, directions: Float[Array, "m t"], drag: Float[Array, "m t"]
+) -> _ByContact:
+    """The problem without the p_t of contacts whose direction of slip is not 0.
+
+    Their `p_t = drag p` moves into the column of p; their p_t get unit rows, rates 0
+    and friction 0.
+    """
+    slides = jnp.any(directions != 0, axis=1)
+    terms = _of_tangents(given.matrix) * drag[None, None]
+    dragged = jnp.sum(terms, axis=3)
+    matrix = given.matrix.at[..., 0].add(dragged)
+    of_rows = jnp.repeat(slides[:, None], directions.shape[1], axis=1)
+    decoupled = jnp.pad(of_rows, ((0, 0), (1, 0)))
+    apart = decoupled[:, :, None, None] | decoupled[None, None]
+    identity = jnp.eye(given.rate.size, dtype=matrix.dtype)
+    unit = identity.reshape(matrix.shape)
+    return given._replace(
+        matrix=jnp.where(apart, unit, matrix),
+        rate=jnp.where(decoupled, 0.0, given.rate),
+        friction=jnp.where(slides, 0.0, given.friction),
+    )
+
+
 def _normals_first(x: Float[Array, "m b N"]) -> Float[Array, "n N"]:
     """Rows of contacts reordered: the normal of each, then the tangents,
     contact-major.
     """
-    return jnp.concatenate([x[:, 0], tangents_of(x).reshape(-1, x.shape[2])])
+    tangents = tangents_of(x).reshape(-1, x.shape[2])
+    return jnp.concatenate([x[:, 0], tangents])
 
 
 def _of_tangents(matrix: Float[Array, "m b m b"]) -> Float[Array, "m b m rows"]:
@@ -276,16 +323,19 @@ def _rates(
 ) -> Float[Array, "m b N"]:
     """Rates `(r, s) = (a, b) + A x` of N impulses x."""
     if len(x) <= ENUMERATED:
-        return problem.rate[..., None] + _times(problem.matrix[..., None], x)
+        product = _times(problem.matrix[..., None], x)
+        return problem.rate[..., None] + product
     # never computed twice
-    return problem.rate[..., None] + jnp.tensordot(problem.matrix, x, 2)
+    product = jnp.tensordot(problem.matrix, x, 2)
+    return problem.rate[..., None] + product
 
 
 def _times(
     matrix: Float[Array, "m b m b #N"], x: Float[Array, "m b N"]
 ) -> Float[Array, "m b N"]:
     """Products `A x` of one or N matrices with N impulses x."""
-    return jnp.sum(matrix * x[None, None], axis=(2, 3))
+    terms = matrix * x[None, None]
+    return jnp.sum(terms, axis=(2, 3))
 
 
 def _bound(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, "m N"]:
@@ -330,7 +380,8 @@ def _misfit(
     else:
         normal = r
     wrong = side - in_disc(side - tangents_of(rate), _bound(problem, x))
-    most = jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1)))
+    of_normals = jnp.abs(normal).max(axis=0)
+    most = jnp.maximum(of_normals, jnp.abs(wrong).max(axis=(0, 1)))
     if size is None:
         size = _size(x)
     return most / size
@@ -356,19 +407,26 @@ def _equations(
         e = jnp.stack([-second, first], axis=1)
         q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
     q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0)))
-    q = q.at[:, 0, 0].set(modes.taking.astype(dtype))
-    unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
-    own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
-    of_normal = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
+    takes = modes.taking.astype(dtype)
+    q = q.at[:, 0, 0].set(takes)
+    identity = jnp.eye(m * (1 + rows), dtype=dtype)
+    unit = identity.reshape(problem.matrix.shape)
+    identity = jnp.eye(m, dtype=dtype)
+    own = identity[:, None, :, None, None]
+    first_row = jnp.eye(1 + rows, dtype=dtype)[0]
+    of_normal = first_row[None, None, None, :, None]
     friction_direction = modes.direction * problem.friction[:, None, None]
-    friction_direction = jnp.pad(friction_direction, ((0, 0), (1, 0), (0, 0)))
+    one_row = (1, 0)
+    friction_direction = jnp.pad(friction_direction, ((0, 0), one_row, (0, 0)))
     pressed = friction_direction[:, :, None, None] * own * of_normal
     # term by term: in single precision XLA may crash on sums within batches of so many
     # axes
     apart = (problem.matrix - unit)[..., None]
     # Q A + (1 - Q) = 1 + Q (A - 1)
-    moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in range(1 + rows))
-    right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
+    entries = range(1 + rows)
+    moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in entries)
+    terms = q * problem.rate[:, None, :, None]
+    right = -jnp.sum(terms, axis=2)
     if problem.load is not None:
         right = right - friction_direction * problem.load[:, None, None]
     return moved + pressed + unit[..., None], right
@@ -390,7 +448,8 @@ def _turned(
     length = length_of(pull)
     bound = _bound(problem, x)
     slides = (length_of(modes.direction) > 0) & (length > 0)
-    direction = jnp.where(slides[:, None], over(pull, length), modes.direction)
+    new = over(pull, length)
+    direction = jnp.where(slides[:, None], new, modes.direction)
     both = bound + length_of(slip)
     share = bound / jnp.where(both > 0, both, 1.0)
     turning = jnp.where(slides & (both > 0), share, 0.0)
@@ -448,15 +507,20 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
     rows = problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
-    angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
-    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    directions = 2 if rows == 1 else _DIRECTIONS
+    angle = 2 * np.pi * (kinds - 2) / directions
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    turned = np.array([[cosine, -sine], [sine, cosine]])
     # rotations (rows, rows, m, N) of the first direction, 0 where a contact does not
     # slide
-    turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
+    of_sliding = np.where(kinds > 1, turned, 0.0)
+    turn = jnp.asarray(of_sliding[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
         begin = tangents_of(problem.rate)[..., None] + 0.0
-        begin = jnp.where(length_of(begin)[:, None] > 0, begin, 1.0)
+        moves = length_of(begin)[:, None] > 0
+        begin = jnp.where(moves, begin, 1.0)
         begin = over(begin, length_of(begin))
     modes = _Modes(
         jnp.asarray(taking | (not problem.complementary)),
@@ -469,32 +533,40 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
     root = precision(dtype).root
     # larger impulses are the rounding of a singular matrix
     good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
-    best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
+    first_good = jnp.argmax(good)
+    best = jnp.where(jnp.any(good), first_good, jnp.nanargmin(misfit))
 
     def differ(values: Float[Array, "m b N"]) -> Bool[Array, ""]:
         """True if these values of consistent modes differ from those of the chosen
         ones.
         """
-        apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
-        return jnp.any(good & (apart > root * _size(x[..., best])))
+        of_best = values[..., best][..., None]
+        apart = jnp.abs(values - of_best).max(axis=(0, 1))
+        different = root * _size(x[..., best])
+        return jnp.any(good & (apart > different))
 
-    status = jnp.where(differ(x), CODE["impulse_not_unique"], CODE["ok"])
-    status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
+    several_impulses = differ(x)
+    status = jnp.where(several_impulses, CODE["impulse_not_unique"], CODE["ok"])
+    several_rates = differ(_rates(problem, x))
+    status = jnp.where(several_rates, CODE["several_outcomes"], status)
     none = CODE["infeasible" if rows == 1 else "max_steps"]
     chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
-    signed = jnp.concatenate([x[:, 0], -x[:, 0]])  # p and -p (2 m, N)
-    extreme = jnp.argmin(jnp.where(good, signed, jnp.inf), axis=1)
-    others = x[..., jnp.where(jnp.any(good), extreme, best)]
-    return _Decision(
-        chosen, x[..., best], jnp.where(jnp.any(good), status, none), others
-    )
+    p = x[:, 0]
+    signed = jnp.concatenate([p, -p])  # p and -p (2 m, N)
+    of_good = jnp.where(good, signed, jnp.inf)
+    extreme = jnp.argmin(of_good, axis=1)
+    chosen_others = jnp.where(jnp.any(good), extreme, best)
+    others = x[..., chosen_others]
+    code = jnp.where(jnp.any(good), status, none)
+    return _Decision(chosen, x[..., best], code, others)
 
 
 def _newton(
     problem: _FrictionProblem, modes: _Modes
 ) -> tuple[_Modes, Float[Array, "m b N"]]:
     """Impulses x of modes, in space with the directions of slip that they lead to."""
-    none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
+    count = modes.taking.shape[1]
+    none = jnp.zeros((*problem.rate.shape, count), problem.matrix.dtype)
     if modes.direction.shape[1] == 1:
         return modes, _solved(problem, modes)
 
@@ -521,8 +593,10 @@ def _at_rest(
     else:
         taking = jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:
-        begins = (problem.load > 0) & (problem.load < precision(x.dtype).eps)
-        taking = taking & ~(begins[:, None] & (normals_of(x) <= margin))
+        small = problem.load < precision(x.dtype).eps
+        begins = (problem.load > 0) & small
+        leaves = begins[:, None] & (normals_of(x) <= margin)
+        taking = taking & ~leaves
     pushes = taking & (normals_of(x) >= -margin)
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
@@ -530,8 +604,10 @@ def _at_rest(
     speed = length_of(slip)
     slides = pushes & (speed > margin)
     sticks = pushes & ~slides & _rubs(problem)
-    direction = jnp.where(slides[:, None], over(slip, speed), 0.0)
-    modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
+    along = over(slip, speed)
+    direction = jnp.where(slides[:, None], along, 0.0)
+    no_turning = jnp.zeros(speed.shape, x.dtype)
+    modes = _Modes(taking, sticks, direction, no_turning)
     return _turned(problem, modes, x[..., None])
 
 
@@ -556,19 +632,20 @@ def _inverted(
 ) -> _Inverted:
     """The equations of modes at x, inverted; see the class."""
     n = x.size
-    matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
+    turned = _turned(problem, modes, x[..., None])
+    matrix, _ = _equations(problem, turned)
     weight = 1 / jnp.sqrt(_weights(problem, x))
-    scaled = (matrix[..., 0] * weight[None, None]).reshape(n, n)
+    weighted = matrix[..., 0] * weight[None, None]
+    scaled = weighted.reshape(n, n)
     if n > _SHARED:
         eye = jnp.eye(n, dtype=x.dtype)
-        return _Inverted(
-            jnp.linalg.inv(scaled + _RIDGE * eye), 0 * eye, weight, jnp.asarray(True)
-        )
+        regular = jnp.linalg.inv(scaled + _RIDGE * eye)
+        return _Inverted(regular, 0 * eye, weight, jnp.asarray(True))
     left, values, right, null = singular_values(scaled)
-    inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
-    return _Inverted(
-        inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True)
-    )
+    divisor = jnp.where(null, 1.0, values)
+    inverse = (right.T / divisor[None]) @ left.T
+    free = jnp.where(null[None], left, 0.0)
+    return _Inverted(inverse, free @ right, weight, jnp.asarray(True))
 
 
 def _weights(problem: _FrictionProblem, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
@@ -576,9 +653,8 @@ def _weights(problem: _FrictionProblem, x: Float[Array, "m b"]) -> Float[Array, 
     of p_t.
     """
     share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
-    return jnp.concatenate(
-        [jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1
-    )
+    of_tangents = jnp.repeat(1 / share, x.shape[1] - 1, 1)
+    return jnp.concatenate([jnp.ones_like(share), of_tangents], 1)
 
 
 def _most_at_rest(
@@ -591,7 +667,8 @@ def _most_at_rest(
     """
     if x.size > _SHARED:
         return modes, _inverted(problem, modes, x)
-    rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
+    margin = jnp.asarray(problem.tolerance, x.dtype)
+    rest = _at_rest(problem, x, margin)
     # loads that begin open contacts
     modes = modes._replace(taking=modes.taking & rest.taking)
     both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
@@ -599,9 +676,10 @@ def _most_at_rest(
     inverted = inverted._replace(held=jnp.array([False, True]))
     first = jax.tree.map(lambda leaf: leaf[0], inverted)
     shared = _on_modes(problem, rest, first, x)
-    missed = _misfit(problem, shared[..., None], _size(x[..., None]))[0]
+    (missed,) = _misfit(problem, shared[..., None], _size(x[..., None]))
     allowed = missed <= problem.tolerance
-    return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
+    choices = (both, inverted)
+    return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), choices)
 
 
 def _freedom(
@@ -617,8 +695,10 @@ def _freedom(
     # contacts that slide may share p so that slip changes
     moves = jnp.abs(problem.matrix.reshape(free.shape) @ free)
     root = precision(free.dtype).root
-    code = jnp.where(jnp.any(free != 0), CODE["impulse_not_unique"], CODE["ok"])
-    return free, jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
+    some_free = jnp.any(free != 0)
+    code = jnp.where(some_free, CODE["impulse_not_unique"], CODE["ok"])
+    some_move = jnp.any(moves > root)
+    return free, jnp.where(some_move, CODE["several_outcomes"], code)
 
 
 def _on_modes(
@@ -641,10 +721,12 @@ def _on_modes(
     def step(_: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """One chord step `y - inverse (E x - f + U_0 V_0^T D W D y)`, x = D y."""
         x = (weight * y).reshape(shape)
-        matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
+        turned = _turned(problem, modes, x[..., None])
+        matrix, right = _equations(problem, turned)
         shared = weight**2 * _weights(problem, x).reshape(n) * y
         free = inverted.pairs @ jnp.where(inverted.held, y - start, shared)
-        missed = matrix.reshape(n, n) @ x.reshape(n) - right.reshape(n) + free
+        product = matrix.reshape(n, n) @ x.reshape(n)
+        missed = product - right.reshape(n) + free
         return y - inverted.inverse @ missed
 
     return (weight * fori_loop(0, 3, step, start)).reshape(shape)
@@ -670,8 +752,10 @@ def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
     length = length_of(pull)
     sticks = (length <= bound) & _rubs(problem)
     slides = ~sticks & (bound > 0)
-    direction = jnp.where(slides[:, None], over(pull, length), 0.0)
-    return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
+    along = over(pull, length)
+    direction = jnp.where(slides[:, None], along, 0.0)
+    modes = _Modes(taking, sticks, direction, jnp.zeros_like(p))
+    return _turned(problem, modes, x)
 
 
 class _Polish(NamedTuple):
@@ -697,14 +781,17 @@ def _search(problem: _FrictionProblem) -> _Decision:
         """x after a step of Newton's method on its modes; what is free in them stays as
         it is.
         """
-        matrix, right = (y[..., 0] for y in _equations(problem, _modes_at(problem, x)))
-        missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
+        equations = _equations(problem, _modes_at(problem, x))
+        matrix, right = (y[..., 0] for y in equations)
+        product = jnp.sum(matrix * x[None, None], axis=(2, 3))
+        missed = (right - product)[..., None]
         return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
 
     def newton(now: _Polish) -> _Polish:
         """The next x of Newton's method, which may be worse, and the best x."""
         x = polish(now.impulse)
-        return _Polish(x, better(misfit, now.best, x), now.steps + 1)
+        best_so_far = better(misfit, now.best, x)
+        return _Polish(x, best_so_far, now.steps + 1)
 
     def wrong(best: Best) -> Bool[Array, ""]:
         """True if the law is not satisfied; also where the misfit is NaN."""
@@ -723,7 +810,8 @@ def _search(problem: _FrictionProblem) -> _Decision:
         if problem.complementary:
             last = number == ATTEMPTS
             swept = _projected(problem, best.impulse, last)
-            tried = better(misfit, tried, jnp.where(last, swept, tried.impulse))
+            last_try = jnp.where(last, swept, tried.impulse)
+            tried = better(misfit, tried, last_try)
         begin = _Polish(tried.impulse, tried, jnp.asarray(0))
         tried = while_loop(goes_on, newton, begin).best
         less = tried.misfit < best.misfit
@@ -739,7 +827,8 @@ def _search(problem: _FrictionProblem) -> _Decision:
     unit = unit.reshape(problem.matrix.shape)
     cones = cones_of(*problem)
     none = jnp.zeros_like(problem.rate)
-    start = Best(none, jnp.inf + 0 * jnp.sum(problem.rate)), jnp.asarray(0)
+    unknown = jnp.inf + 0 * jnp.sum(problem.rate)
+    start = Best(none, unknown), jnp.asarray(0)
     if problem.complementary:
         most = ATTEMPTS + 1
     else:
@@ -814,7 +903,8 @@ def distribute(
     rows = len(matrix) // len(limit)
     limit = jnp.where(candidates, limit, 0.0)
     each = jnp.repeat(candidates, rows, axis=0)
-    matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
+    both = each[:, None] & each[None]
+    matrix = jnp.where(both, matrix, 0.0)
     rate = jnp.where(each, rate, 0.0)
     force = _relaxed(matrix, rate, limit)
     slip = rate + times(matrix, force)
@@ -822,13 +912,15 @@ def distribute(
     if rows == 1:
         scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
         stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
-    pushed = jnp.repeat(_lengths(force, rows) > 0, rows, axis=0)
+    loaded = _lengths(force, rows) > 0
+    pushed = jnp.repeat(loaded, rows, axis=0)
     return candidates & stick, jnp.where(pushed, -force, slip)
 
 
 def _lengths(force: Float[Array, "t *B"], rows: int) -> Float[Array, "m *B"]:
     """|lambda_j| of each contact j, from its one or two tangential rows."""
-    return jnp.sqrt(jnp.sum(force.reshape(-1, rows, *force.shape[1:]) ** 2, axis=1))
+    by_contact = force.reshape(-1, rows, *force.shape[1:])
+    return jnp.sqrt(jnp.sum(by_contact**2, axis=1))
 
 
 class _Sweep(NamedTuple):
@@ -839,6 +931,10 @@ class _Sweep(NamedTuple):
     done: Int[Array, ""]
 
 
+# In turn, as no other solver is as quick: in 256 lanes of 2 to 8 contacts accelerated
+# projections (`many_contacts.py`) take 4 to 130 times as long, and descent with
+# Anderson's extrapolation (`step_impulses.py`) leaves one lane in a hundred off by 4 %
+# of the largest limit and more.
 def _relaxed(
     matrix: Float[Array, "t t B"], rate: Float[Array, "t B"], limit: Float[Array, "m B"]
 ) -> Float[Array, "t B"]:
@@ -850,7 +946,8 @@ def _relaxed(
     rows = t // m
     least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
     of_contacts = matrix.reshape(m, rows, t, *batch)
-    own = matrix[np.arange(t), np.arange(t)].reshape(m, rows, *batch)
+    diagonal = matrix[np.arange(t), np.arange(t)]
+    own = diagonal.reshape(m, rows, *batch)
     stiffness = jnp.sum(own, axis=1)
     stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
 
@@ -880,5 +977,6 @@ def _relaxed(
         """True while forces change and sweeps are left."""
         return now.changes & (now.done < _RELAXATIONS)
 
-    start = _Sweep(jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))
+    some_load = jnp.any(limit > 0)
+    start = _Sweep(jnp.zeros_like(rate), some_load, jnp.asarray(0))
     return while_loop(goes_on, sweep, start).force

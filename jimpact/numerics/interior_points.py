@@ -106,9 +106,12 @@ def cones_of(
     g.
     """
     large = jnp.maximum(friction, 1.0)
-    sides = jnp.repeat((friction / large)[:, None], rate.shape[1] - 1, axis=1)
-    scale = jnp.concatenate([1 / large[:, None], sides], axis=1)
-    coupling = matrix * scale[:, :, None, None] * scale[None, None]
+    of_contacts = (friction / large)[:, None]
+    sides = jnp.repeat(of_contacts, rate.shape[1] - 1, axis=1)
+    normals = 1 / large[:, None]
+    scale = jnp.concatenate([normals, sides], axis=1)
+    scaled_rows = matrix * scale[:, :, None, None]
+    coupling = scaled_rows * scale[None, None]
     if load is None:
         pressed = jnp.zeros_like(friction)
     else:
@@ -154,7 +157,8 @@ def within_cones(
         """True while the misfit is not close to 0, NaN too, and iterations are left."""
         return ~(now.best.misfit <= close) & (now.done < most)
 
-    first = Best(_impulse(cones, middle), jnp.asarray(jnp.inf, unit.dtype) + nan)
+    unknown = jnp.asarray(jnp.inf, unit.dtype) + nan
+    first = Best(_impulse(cones, middle), unknown)
     start = _Iterate(middle, first, jnp.asarray(0))
     return while_loop(goes_on, iterate, start).best
 
@@ -165,12 +169,14 @@ def better(
     """The impulses of less misfit: `best`, or x."""
     wrong = misfit(x)
     less = wrong < best.misfit
-    return Best(jnp.where(less, x, best.impulse), jnp.where(less, wrong, best.misfit))
+    impulse = jnp.where(less, x, best.impulse)
+    return Best(impulse, jnp.where(less, wrong, best.misfit))
 
 
 def _impulse(cones: Cones, at: _Inside) -> Float[Array, "m b"]:
     """Impulses (p, p_t) of a point in the units of the problem."""
-    return cones.scale * jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1)
+    normal = _normal(cones, at)[:, None]
+    return cones.scale * jnp.concatenate([normal, at.side], axis=1)
 
 
 def _normal(cones: Cones, at: _Inside) -> Float[Array, " m"]:
@@ -184,7 +190,8 @@ def _mean(cones: Cones, at: _Inside) -> Float[Array, ""]:
     """Mean of the products a nu and Y . K over all contacts, which is 0 at the
     solution.
     """
-    cone = (at.push + cones.load) * at.bound + jnp.sum(at.side * at.slip, axis=1)
+    product = jnp.sum(at.side * at.slip, axis=1)
+    cone = (at.push + cones.load) * at.bound + product
     return jnp.mean(at.push * at.normal + cone) / 2
 
 
@@ -206,7 +213,8 @@ def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
         factors = jnp.stack([1.0 + 0 * aim, aim])
         way = jnp.concatenate([coefficients, factors])
         way = jax.tree.map(lambda form: jnp.tensordot(form, way, axes=1), change)
-        room = jnp.minimum(_room_in_cone(cones, at, way), _room_of_normals(at, way))
+        of_normals = _room_of_normals(at, way)
+        room = jnp.minimum(_room_in_cone(cones, at, way), of_normals)
         part = jnp.minimum(1.0, _WITHIN * room)
         return jax.tree.map(lambda x, dx: x + part * dx, at, way)
 
@@ -221,7 +229,8 @@ def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
         share = jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2
         return point, jnp.maximum(share, _LEAST_AIM) * mean
 
-    return fori_loop(0, 2, look, (at, jnp.zeros_like(mean)))[0]
+    begin = (at, jnp.zeros_like(mean))
+    return fori_loop(0, 2, look, begin)[0]
 
 
 def _linearized(
@@ -240,13 +249,16 @@ def _linearized(
     x = eye[:n].reshape(m, b, n + 2)
     constant = eye[n][None]
     aim = eye[n + 1][None]
-    rates = jnp.pad(cones.coupling.reshape(m, b, n), ((0, 0), (0, 0), (0, 2)))
-    own = jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1).reshape(n)
-    missed = cones.constant + jnp.tensordot(
-        cones.coupling.reshape(m, b, n), own, axes=1
-    )
-    speed = jnp.sqrt(jnp.sum(at.slip**2, axis=1))
-    turns = (speed / (speed**2 + slides * _mean(cones, at)))[:, None] * at.slip
+    of_rows = cones.coupling.reshape(m, b, n)
+    rates = jnp.pad(of_rows, ((0, 0), (0, 0), (0, 2)))
+    normal_rows = _normal(cones, at)[:, None]
+    own = jnp.concatenate([normal_rows, at.side], axis=1).reshape(n)
+    coupled = jnp.tensordot(cones.coupling.reshape(m, b, n), own, axes=1)
+    missed = cones.constant + coupled
+    square = jnp.sum(at.slip**2, axis=1)
+    speed = jnp.sqrt(square)
+    smoothed = speed**2 + slides * _mean(cones, at)
+    turns = (speed / smoothed)[:, None] * at.slip
 
     def dot(
         values: Float[Array, "m rows"], forms: Float[Array, "m rows w"]
@@ -262,35 +274,44 @@ def _linearized(
         push = x[:, 0]
     else:
         both = (at.push + at.normal)[:, None]
-        push = (product + at.push[:, None] * x[:, 0]) / both
+        pushed = at.push[:, None] * x[:, 0]
+        push = (product + pushed) / both
     radius = at.push + cones.load
-    inner = radius * at.bound + jnp.sum(at.side * at.slip, axis=1)
-    bound = aim - inner[:, None] * constant - at.bound[:, None] * push
-    bound = (bound - dot(at.side, slip) - dot(at.slip, side)) / radius[:, None]
+    of_sides = jnp.sum(at.side * at.slip, axis=1)
+    inner = radius * at.bound + of_sides
+    known_part = aim - inner[:, None] * constant
+    bound = known_part - at.bound[:, None] * push
+    turned = bound - dot(at.side, slip) - dot(at.slip, side)
+    bound = turned / radius[:, None]
     normal = rates[:, 0] + missed[:, 0, None] * constant
     if cones.complementary:
         off = speed - at.bound - at.normal
-        normal = normal + off[:, None] * constant + dot(turns, slip) - bound
-        first = at.push[:, None] * normal + at.normal[:, None] * push - product
+        known_part = normal + off[:, None] * constant
+        normal = known_part + dot(turns, slip) - bound
+        of_normal = at.push[:, None] * normal
+        first = of_normal + at.normal[:, None] * push - product
     else:
         first = normal
         normal = push - x[:, 0]
-    outer = radius[:, None] * at.slip + at.bound[:, None] * at.side
-    sides = radius[:, None, None] * slip + at.bound[:, None, None] * side
-    sides = (
-        sides + at.side[..., None] * bound[:, None] + at.slip[..., None] * push[:, None]
-    )
+    of_slip = radius[:, None] * at.slip
+    outer = of_slip + at.bound[:, None] * at.side
+    of_slips = radius[:, None, None] * slip
+    sides = of_slips + at.bound[:, None, None] * side
+    with_bound = sides + at.side[..., None] * bound[:, None]
+    sides = with_bound + at.slip[..., None] * push[:, None]
     sides = sides + outer[..., None] * constant[None]
     equations = jnp.concatenate([first[:, None], sides], axis=1)
     matrix = equations[..., :n].reshape(m, b, m, b)
-    return _Inside(push, normal, side, bound, slip), matrix, -equations[..., n:]
+    point = _Inside(push, normal, side, bound, slip)
+    return point, matrix, -equations[..., n:]
 
 
 def _room_of_normals(at: _Inside, way: _Inside) -> Float[Array, ""]:
     """Largest multiple of the change `way` with which all a and nu stay >= 0."""
     value = jnp.concatenate([at.push, at.normal])
     falls = jnp.concatenate([way.push, way.normal]) / value
-    return jnp.min(quotient(-1, falls, where=falls < 0, otherwise=jnp.inf))
+    room = quotient(-1, falls, where=falls < 0, otherwise=jnp.inf)
+    return jnp.min(room)
 
 
 def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> Float[Array, ""]:
@@ -299,13 +320,17 @@ def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> Float[Array, ""]:
     With each turned into the middle of the cone, by a hyperbolic rotation.
     """
     first = jnp.concatenate([at.push + cones.load, at.bound])
-    side, change = (jnp.concatenate([x.side, x.slip]) for x in (at, way))
+    pairs = ([x.side, x.slip] for x in (at, way))
+    side, change = (jnp.concatenate(pair) for pair in pairs)
     grows = jnp.concatenate([way.push, way.bound])
     square = first**2 - jnp.sum(side**2, axis=1)
-    root = jnp.sqrt(jnp.maximum(square, precision(first.dtype).tiny))
+    least = precision(first.dtype).tiny
+    root = jnp.sqrt(jnp.maximum(square, least))
     first = first / root
     side = side / root[:, None]
     along = first * grows - jnp.sum(side * change, axis=1)
-    across = change - ((along + grows) / (1 + first))[:, None] * side
-    out = jnp.max((jnp.sqrt(jnp.sum(across**2, axis=1)) - along) / root)
+    share = (along + grows) / (1 + first)
+    across = change - share[:, None] * side
+    speed = jnp.sqrt(jnp.sum(across**2, axis=1))
+    out = jnp.max((speed - along) / root)
     return quotient(1, out, where=out > 0, otherwise=jnp.inf)

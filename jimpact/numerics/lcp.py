@@ -96,9 +96,8 @@ def solve_lcp(
         regular = is_regular(matrix)
     matrix = as_matrix(matrix)
     diagonal = jax.lax.stop_gradient(jnp.diagonal(matrix))
-    scale = jnp.where(
-        diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0
-    )
+    positive = jnp.where(diagonal > 0, diagonal, 1.0)
+    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(positive), 1.0)
     a = matrix * scale[:, None] * scale[None, :]
     b = q * scale
     largest = jax.lax.stop_gradient(jnp.abs(b).max())
@@ -108,10 +107,12 @@ def solve_lcp(
     support, code = _support(*constant)
     z = _solve_on(support, a, -b, symmetric)
     wrong = _wrong(*constant, support, jax.lax.stop_gradient(z))
-    code = jnp.where((code == CODE["ok"]) & wrong, CODE["max_steps"], code)
+    unsolved = (code == CODE["ok"]) & wrong
+    code = jnp.where(unsolved, CODE["max_steps"], code)
     if symmetric and not regular:
         z, singular = _least_norm(a, b, z)
-        code = jnp.where(singular, jnp.maximum(code, CODE["impulse_not_unique"]), code)
+        gravest = jnp.maximum(code, CODE["impulse_not_unique"])
+        code = jnp.where(singular, gravest, code)
     z = jnp.where(z < 0, 0.0, z)  # only rounding is negative
     w = jnp.where(support, 0.0, a @ z + b)
     return LCP(z * scale * size, w / scale * size, code)
@@ -141,20 +142,20 @@ def _solve_sparse(matrix: Sparse, q: Float[Array, " m"]) -> LCP:
     support = z > 0
     scale = 1 / jnp.sqrt(constant.diagonal)
     a = matrix.scaled(scale).within(support)
-    solved = scale * conjugate_gradients(
-        lambda x: a @ x, jnp.where(support, -q * scale, 0.0)
-    )
+    right = jnp.where(support, -q * scale, 0.0)
+    solved = scale * conjugate_gradients(lambda x: a @ x, right)
     z = z + (solved - jax.lax.stop_gradient(solved))
     # A is singular if a right side is not in its range: nearly all have a part in its
     # null space
-    other = jnp.where(
-        support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0
-    )
+    index = jnp.arange(1.0, len(q) + 1, dtype=q.dtype)
+    other = jnp.where(support, jnp.cos(index**2), 0.0)
     fixed = jax.lax.stop_gradient(a)
-    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: fixed @ x, other)))
+    solution = conjugate_gradients(lambda x: fixed @ x, other)
+    singular = jnp.any(jnp.isnan(solution))
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
     code = jnp.where(found.misfit > tolerance, CODE["max_steps"], code)
-    return LCP(z, jnp.where(support, 0.0, matrix @ z + q), code)
+    w = jnp.where(support, 0.0, matrix @ z + q)
+    return LCP(z, w, code)
 
 
 def gathered_rounding(unknowns: int, dtype: Any) -> float:
@@ -174,7 +175,8 @@ def _solve_on(
 ) -> Float[Array, " m"]:
     """z with `A_SS z_S = right_S` on the support S, z = 0 elsewhere."""
     both = support[:, None] & support[None, :]
-    masked = jnp.where(both, a, jnp.eye(a.shape[0], dtype=a.dtype))
+    identity = jnp.eye(a.shape[0], dtype=a.dtype)
+    masked = jnp.where(both, a, identity)
     right = jnp.where(support, right, 0.0)
     if symmetric:
         return solve_definite(masked, right)
@@ -194,11 +196,14 @@ def _least_norm(
     w = jax.lax.stop_gradient(a @ z + b)
     tight = w <= gathered_rounding(len(b), b.dtype)
     both = tight[:, None] & tight[None, :]
-    projector, singular = null_projector(jnp.where(both, a, jnp.eye(m, dtype=b.dtype)))
+    identity = jnp.eye(m, dtype=b.dtype)
+    projector, singular = null_projector(jnp.where(both, a, identity))
     rest = z - projector @ z
     # rounding of `rest` at zero must not start pivots
-    noise = jnp.abs(rest) <= gathered_rounding(len(b), b.dtype) * jnp.abs(z).max()
-    support, _ = _support(projector, jnp.where(noise, 0.0, jax.lax.stop_gradient(rest)))
+    rounding = gathered_rounding(len(b), b.dtype)
+    noise = jnp.abs(rest) <= rounding * jnp.abs(z).max()
+    constant = jax.lax.stop_gradient(rest)
+    support, _ = _support(projector, jnp.where(noise, 0.0, constant))
     y = _solve_on(support, projector, -rest)
     return jnp.where(singular, rest + projector @ y, z), singular
 
@@ -223,7 +228,8 @@ def _wrong(
     gathered = gathered_rounding(len(b), b.dtype)
     noise = _rounding(len(b), b.dtype) * size  # of A z, where the largest q is 1
     w = jnp.where(support, 0.0, a @ z + b)
-    signs = (z >= -gathered * jnp.maximum(1.0, size)) & (w >= -gathered - noise)
+    right_z = z >= -gathered * jnp.maximum(1.0, size)
+    signs = right_z & (w >= -gathered - noise)
     return ~(jnp.all(signs) & (noise < 1))  # True where z is NaN
 
 
@@ -237,11 +243,12 @@ def _support(
     dtype = b.dtype
     tolerance = _rounding(m, dtype)
     ones = jnp.ones((m, 1), dtype)
-    rows = jnp.concatenate([jnp.eye(m, dtype=dtype), -a, -ones, b[:, None]], axis=1)
+    identity = jnp.eye(m, dtype=dtype)
+    rows = jnp.concatenate([identity, -a, -ones, b[:, None]], axis=1)
     artificial = 2 * m
-    start = _Tableau(
-        rows, jnp.arange(m), jnp.asarray(artificial), jnp.asarray(False), jnp.asarray(0)
-    )
+    basis = jnp.arange(m)
+    entering = jnp.asarray(artificial)
+    start = _Tableau(rows, basis, entering, jnp.asarray(False), jnp.asarray(0))
     # z = 0 solves it; else the artificial variable enters at the most negative row
     needed = jnp.min(b) < -tolerance
     first = _pivot(start, jnp.argmin(b))
@@ -264,8 +271,10 @@ def _support(
 
     end = while_loop(going, one, first)
     number = jnp.arange(m)
-    support = needed & jnp.any(end.basis[:, None] == (m + number)[None, :], axis=0)
-    left = jnp.max(jnp.where(end.basis == artificial, end.rows[:, -1], 0.0))
+    basic = end.basis[:, None] == (m + number)[None, :]
+    support = needed & jnp.any(basic, axis=0)
+    of_artificial = jnp.where(end.basis == artificial, end.rows[:, -1], 0.0)
+    left = jnp.max(of_artificial)
     stuck = needed & (left > gathered_rounding(len(b), b.dtype))
     reason = jnp.where(end.ray, CODE["infeasible"], CODE["max_steps"])
     return support, jnp.where(stuck, reason, CODE["ok"])
@@ -281,11 +290,11 @@ def _leaving(
     problems; a cycle would end as `max_steps`.
     """
     m = state.basis.shape[0]
-    column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(
-        state.rows.dtype
-    )
+    enters = jnp.arange(2 * m + 2) == state.entering
+    column = state.rows @ enters.astype(state.rows.dtype)
     candidates = column > tolerance
-    ratio = quotient(state.rows[:, -1], column, where=candidates, otherwise=jnp.inf)
+    right = state.rows[:, -1]
+    ratio = quotient(right, column, where=candidates, otherwise=jnp.inf)
     return jnp.argmin(ratio), ~jnp.any(candidates)
 
 
@@ -295,7 +304,8 @@ def _pivot(state: _Tableau, row: Int[Array, ""]) -> _Tableau:
     """
     m = state.basis.shape[0]
     dtype = state.rows.dtype
-    column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(dtype)
+    enters = jnp.arange(2 * m + 2) == state.entering
+    column = state.rows @ enters.astype(dtype)
     chosen = jnp.arange(m) == row
     pivot_row = chosen.astype(dtype) @ state.rows
     pivot_row = pivot_row / jnp.sum(jnp.where(chosen, column, 0.0))

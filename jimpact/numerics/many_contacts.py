@@ -8,7 +8,9 @@ The problem is that of `friction.solve`, complementary,
 for thousands of contacts, to a tolerance, without derivatives and without the search
 for further solutions. One iteration is a step against (r, s) and a projection onto p >=
 0 and onto the discs |p_t| <= mu p; Nesterov's momentum, given up where it points
-uphill, makes some hundred of them enough for a pile.
+uphill, makes some hundred of them enough for a pile. Anderson's extrapolation, which
+`step_impulses.py` uses for few contacts, needs 691 products for 316 (a pile of 74
+contacts, misfit 1e-4), and finds no end of 322 contacts in 4000.
 """
 
 from collections.abc import Callable
@@ -123,7 +125,8 @@ def solve_many(
         """State after the step `x = P(y - (A y + rate) / L)`, P the projection on the
         cones.
         """
-        x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope, carried)
+        gradient = at.ay + goal
+        x = _projected(at.y - gradient / at.inverse_step_size, slope, carried)
         return _with_momentum(at, x, times(x), most)
 
     # NaN where a rate is not finite
@@ -131,11 +134,13 @@ def solve_many(
     ax = times(x)
     unit = jnp.ones((), x.dtype)
     inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
-    begin = _At(x, ax, x, ax, unit, inverse_step_size, x, jnp.inf * unit, jnp.int32(0))
+    unknown = jnp.inf * unit
+    begin = _At(x, ax, x, ax, unit, inverse_step_size, x, unknown, jnp.int32(0))
     end = while_loop(going, iterate, begin)
     relative = end.misfit / jnp.where(size > 0, size, 1.0)
     residual = end.misfit * jnp.sqrt(jnp.max(diagonal))
-    return Many(end.best * scale, relative, residual, end.tries, end.inverse_step_size)
+    impulse = end.best * scale
+    return Many(impulse, relative, residual, end.tries, end.inverse_step_size)
 
 
 def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
@@ -145,7 +150,8 @@ def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
     of_tangents = jnp.mean(tangents_of(diagonal), axis=1, keepdims=True)
     squares = jnp.concatenate([normals_of(diagonal), of_tangents], axis=1)
     squares = jnp.where(squares > 0, squares, 1.0)
-    return 1 / jnp.sqrt(squares[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)])
+    kind = jnp.minimum(jnp.arange(diagonal.shape[1]), 1)
+    return 1 / jnp.sqrt(squares[:, kind])
 
 
 def _projected(
@@ -158,7 +164,8 @@ def _projected(
     pressed = p
     if load is not None:
         pressed = p + load[:, None]
-    side = in_disc(tangents_of(x)[..., None], slope[:, None] * pressed)
+    radius = slope[:, None] * pressed
+    side = in_disc(tangents_of(x)[..., None], radius)
     return jnp.concatenate([p, side[..., 0]], axis=1)
 
 
@@ -176,19 +183,20 @@ def _with_momentum(
     step = x - at.y
     a_step = ax - at.ay
     square = jnp.vdot(step, step)
-    overshoots = jnp.vdot(step, a_step) > at.inverse_step_size * square * (1 + 1e-9)
+    allowed_curvature = at.inverse_step_size * square * (1 + 1e-9)
+    overshoots = jnp.vdot(step, a_step) > allowed_curvature
     restarts = overshoots | (jnp.vdot(step, x - at.x) < 0)
-    weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
+    root = jnp.sqrt(1 + 4 * at.weight**2)
+    weight = (1 + root) / 2
     # less momentum where many iterations did not suffice
-    allowed = jnp.asarray(MOMENTUM, x.dtype)[
-        len(MOMENTUM) * at.tries // jnp.maximum(most, 1)
-    ]
-    momentum = jnp.where(restarts, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
+    stage = len(MOMENTUM) * at.tries // jnp.maximum(most, 1)
+    allowed = jnp.asarray(MOMENTUM, x.dtype)[stage]
+    of_nesterov = (at.weight - 1) / weight
+    momentum = jnp.where(restarts, 0.0, jnp.minimum(of_nesterov, allowed))
     x = jnp.where(overshoots, at.x, x)
     ax = jnp.where(overshoots, at.ax, ax)
-    misfit = jnp.where(
-        overshoots, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step))
-    )
+    change = at.inverse_step_size * jnp.max(jnp.abs(step))
+    misfit = jnp.where(overshoots, jnp.inf, change)
     better = ~(misfit >= at.misfit)  # also NaN, which is then the result
     return _At(
         x=x,

@@ -14,7 +14,8 @@ and the radii known this is a convex problem; projected gradients, extrapolated 
 Anderson's method, solve it from the impulses of the step before, scaled to the new
 load. Which contacts stick, which slip and where to, and who carries what where contacts
 are redundant, comes out of the minimum: no modes, nothing to be compiled for each
-contact.
+contact. Nesterov's momentum (`many_contacts.py`), which knows no unloading, takes 2 to
+9 times as long in 256 lanes of 2 to 8 contacts.
 """
 
 from typing import Any, NamedTuple
@@ -59,11 +60,15 @@ class StepProblem(NamedTuple):
         """
         m = len(self.load)
         step = self.descent[: len(self.load)]
-        cut = (self.unloading * tried[:m] + step * self.load) / (self.unloading + step)
-        normal = jnp.where(self.unloading > 0, jnp.clip(cut, 0.0, self.load), self.load)
-        side = tried[m:].reshape(m, -1, tried.shape[-1])
+        target = self.unloading * tried[:m] + step * self.load
+        cut = target / (self.unloading + step)
+        unloaded = jnp.clip(cut, 0.0, self.load)
+        normal = jnp.where(self.unloading > 0, unloaded, self.load)
+        lanes = tried.shape[-1]
+        side = tried[m:].reshape(m, -1, lanes)
         side = in_disc(side, self.friction * normal)
-        return jnp.concatenate([normal, side.reshape(tried[m:].shape)])
+        tangential = side.reshape(tried[m:].shape)
+        return jnp.concatenate([normal, tangential])
 
     def velocities(self, impulses: Float[Array, "n B"]) -> Float[Array, "n B"]:
         """`w = b + K q` after the impulses q."""
@@ -78,16 +83,17 @@ class StepProblem(NamedTuple):
         n = len(impulses)
         m = len(self.load)
         kinds = n // m
-        rows = np.concatenate(
-            [np.arange(m)[:, None], m + np.arange(n - m).reshape(m, -1)], axis=1
-        )
+        tangents = m + np.arange(n - m).reshape(m, -1)
+        rows = np.concatenate([np.arange(m)[:, None], tangents], axis=1)
         owner = np.argsort(rows.ravel()) // kinds  # the contact of each row
         tried = impulses - self.descent * self.velocities(impulses)
         one = jnp.eye(n, dtype=tried.dtype)[..., None]
-        moved = one - self.descent[:, None] * self.coupling.dense(n)  # d (q - d w) / dq
+        coupling = self.coupling.dense(n)
+        moved = one - self.descent[:, None] * coupling  # d (q - d w) / dq
         matrix = jnp.broadcast_to(one, moved.shape)
         for kind in range(kinds):  # the normals, the first tangents, the second ones
-            direction = jnp.zeros_like(tried).at[rows[:, kind]].set(1.0)
+            kind_rows = rows[:, kind]
+            direction = jnp.zeros_like(tried).at[kind_rows].set(1.0)
             _, slope = jax.jvp(self.projected, (tried,), (direction,))
             matrix = matrix - slope[:, None] * moved[rows[owner, kind]]
         return matrix
@@ -108,20 +114,25 @@ def descent_lengths(
     """
     n = len(coupling)
     size = coupling[jnp.arange(n), jnp.arange(n)]
-    side = size[contacts:].reshape(contacts, -1, size.shape[-1])
+    lanes = size.shape[-1]
+    side = size[contacts:].reshape(contacts, -1, lanes)
     rows = side.shape[1]
     if rows:
-        largest = jnp.repeat(jnp.max(side, axis=1), rows, axis=0)
+        of_contacts = jnp.max(side, axis=1)
+        largest = jnp.repeat(of_contacts, rows, axis=0)
         size = jnp.concatenate([size[:contacts], largest])
     size = jnp.where(size > 0, size, 1.0)
     root = jnp.sqrt(size)
     scaled = coupling / (root[:, None] * root[None])
     if friction_only:
-        scaled = scaled.at[:contacts].set(0.0).at[:, :contacts].set(0.0)
-    row_sum = jnp.max(jnp.sum(jnp.abs(scaled), axis=1), axis=0, keepdims=True)
+        without_rows = scaled.at[:contacts].set(0.0)
+        scaled = without_rows.at[:, :contacts].set(0.0)
+    of_rows = jnp.sum(jnp.abs(scaled), axis=1)
+    row_sum = jnp.max(of_rows, axis=0, keepdims=True)
     square = jnp.einsum("ij...,jk...->ik...", scaled, scaled)
     fourth = jnp.einsum("ij...,jk...->ik...", square, square)
-    norm = jnp.sum(fourth**2, axis=(0, 1))[None] ** (1 / 8)
+    eighth_power = jnp.sum(fourth**2, axis=(0, 1))[None]
+    norm = eighth_power ** (1 / 8)
     bound = size * jnp.minimum(row_sum, norm)  # of the eigenvalues
     return 1 / jnp.where(bound > 0, bound, 1.0)
 
@@ -152,16 +163,17 @@ def extrapolated(
 
     # normal equations [aa ab; ab bb] c = [a; b]; only c_1 where both changes are
     # parallel
-    aa, ab, bb = (
-        dot(*x)
-        for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2)
-    )
-    both = aa * bb - ab**2 > precision(weight.dtype).eps * aa * bb
+    aa = dot(change.way, change.way)
+    ab = dot(change.way, before.way)
+    bb = dot(before.way, before.way)
+    parallel = precision(weight.dtype).eps * aa * bb
+    both = aa * bb - ab**2 > parallel
     aa = jnp.where(aa > 0, aa, 1.0)
     bb = jnp.where(both, bb, 1.0)
     ab = jnp.where(both, ab, 0.0)
     a = dot(change.way, now.way)
-    b = jnp.where(both, dot(before.way, now.way), 0.0)
+    of_before = dot(before.way, now.way)
+    b = jnp.where(both, of_before, 0.0)
     determinant = aa * bb - ab**2
     first = (a * bb - b * ab) / determinant
     second = (b * aa - a * ab) / determinant
@@ -202,11 +214,11 @@ def solve(
         """
         reached = problem.projected(s.ahead - problem.descent * s.velocities)
         now = Move(reached, reached - s.ahead)
-        changes = jax.tree.map(
-            lambda a, b: jnp.where(s.done > 0, a - b, 0.0), now, s.last
-        )
+        goes_on = s.done > 0
+        changes = jax.tree.map(lambda a, b: jnp.where(goes_on, a - b, 0.0), now, s.last)
         ahead = extrapolated(now, changes, s.change, weight)
-        error = jnp.max(jnp.abs(weight * now.way), axis=0, keepdims=True)
+        moved = jnp.abs(weight * now.way)
+        error = jnp.max(moved, axis=0, keepdims=True)
         right = s.error <= tolerance  # such lanes keep what they have
         impulses = jnp.where(right, s.impulses, reached)
         error = jnp.where(right, s.error, error)
@@ -215,9 +227,8 @@ def solve(
 
     none = Move(*[jnp.zeros_like(start)] * 2)
     wrong = jnp.full_like(tolerance, jnp.inf)
-    first = Sweep(
-        start, problem.velocities(start), none, none, start, wrong, jnp.asarray(0)
-    )
+    at_start = problem.velocities(start)
+    first = Sweep(start, at_start, none, none, start, wrong, jnp.asarray(0))
     end = jax.lax.while_loop(going, sweep, first)
     return end.impulses, end.error
 

@@ -33,6 +33,7 @@ per-impact scalars are rows of two arrays, `Step.clock` and `StepperState.progre
 
 import abc
 import enum
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -146,7 +147,8 @@ class Flow(abc.ABC):
         Those of the `target` of a landing have to be exact, others are looked at to
         predict events.
         """
-        return jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))
+        margins_at = partial(self.margins, const, modes)
+        return jax.jvp(margins_at, (y,), (dy,))
 
     @abc.abstractmethod
     def switch(
@@ -233,8 +235,9 @@ def put(
     index: Integer[Array, ""],
 ) -> Shaped[Array, "count *rows"]:
     """The buffer with `value` in the row `index`."""
+    row = value[None]
     return jax.lax.dynamic_update_slice_in_dim(
-        buffer, value[None], index, 0, allow_negative_indices=False
+        buffer, row, index, 0, allow_negative_indices=False
     )
 
 
@@ -297,15 +300,18 @@ def _frame(
     c0 = flow.margins(const, s.modes, y)
     # a landing from a margin that is already 0 has length 0, and no root
     root = flow.rooted(s.modes) & (c0 > flow.zero_margin)
-    xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
+    positive = jnp.where(root, c0, 1.0)
+    xi0 = jnp.where(root, jnp.sqrt(positive), c0)
     xi0 = total(jnp.where(s.target, xi0, 0.0))
-    rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + s.in_root
+    in_root = root.astype(y.dtype)
+    rooted = total(jnp.where(s.target, in_root, 0.0)) + s.in_root
     start = jnp.where(lands, xi0, s.start)
     # a margin that counts as 0 takes no time, however slow it is; its derivatives
     # remain
     zero_length = lands & (jnp.abs(xi0) <= flow.zero_margin)
     length = jnp.where(lands, -xi0, s.length)
-    length = jnp.where(zero_length, jax.lax.stop_gradient(xi0) - xi0, length)
+    no_length = jax.lax.stop_gradient(xi0) - xi0
+    length = jnp.where(zero_length, no_length, length)
     variable = _StepVariable(start, length, rooted, zero_length)
     return const, jax.lax.stop_gradient(c0), variable
 
@@ -343,17 +349,21 @@ def _slopes(
 
     def rates_of_margins() -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
         """Margins and their rates in the flow's own time."""
-        return flow.margins_with_rates(const, s.modes, now, dy[: len(now)], s.target)
+        rates = dy[: len(now)]
+        return flow.margins_with_rates(const, s.modes, now, rates, s.target)
 
     if flow.near:  # of costly margins: steps in time need them at their ends only
-        needed = jnp.any(s.lands > 0) | (i == 0) | (i == STAGES)
+        at_an_end = (i == 0) | (i == STAGES)
+        needed = jnp.any(s.lands > 0) | at_an_end
         none = jnp.zeros_like(s.target, now.dtype)
         value, dc = cond(needed, rates_of_margins, lambda: (none, none))
     else:
         value, dc = rates_of_margins()
     # dt/dxi = N / R: N = 2 xi of a root, else 1; R = dc_k/dt of a landing, else 1
-    rate = total(jnp.where(s.target, dc, 0.0)) + (1 - s.lands)
-    rate = jnp.where(frame.zero_length & (rate == 0), jnp.inf, rate)
+    of_target = jnp.where(s.target, dc, 0.0)
+    rate = total(of_target) + (1 - s.lands)
+    never = frame.zero_length & (rate == 0)
+    rate = jnp.where(never, jnp.inf, rate)
     dt = (1 + frame.rooted * (2 * xi - 1)) / rate
     rows = [dy[first:last] * dt for first, last in pairwise(ends)]
     return [*rows, dt], jax.lax.stop_gradient((value, dc))
@@ -387,7 +397,8 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
             ),
             *(flow, const, frame, y, change),
         )
-        return (new[: len(blocks)], new[len(blocks) :]), margins
+        slopes = new[: len(blocks)]
+        return (slopes, new[len(blocks) :]), margins
 
     row = [
         dual_like((flow, y), jnp.zeros((1, k, *batch), dtype))
@@ -397,10 +408,13 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
         stages = _scanned
     else:
         stages = _written_out
-    tables, (d0, c1, d1) = stages(evaluate, row, count, jnp.zeros_like(s.target, dtype))
-    weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
+    no_margins = jnp.zeros_like(s.target, dtype)
+    tables, (d0, c1, d1) = stages(evaluate, row, count, no_margins)
+    padded = np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES)))
+    weights = jnp.asarray(padded, dtype)
     change, errors = _weighted(tables, weights, frame.length)
-    return _StepResult(change, errors[:, :n], (c0, c1), (d0, d1))
+    of_state = errors[:, :n]
+    return _StepResult(change, of_state, (c0, c1), (d0, d1))
 
 
 def _scanned(
@@ -414,7 +428,8 @@ def _scanned(
     it compiles quickly.
     """
     dtype = none.dtype
-    table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
+    padded = np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES)))
+    table = jnp.asarray(padded, dtype)
 
     def stage(carry: Any, at: Any) -> tuple[Any, None]:
         """Tables with the slopes of stage i, whose state follows from those of earlier
@@ -422,11 +437,13 @@ def _scanned(
         """
         slopes, added, first, *_ = carry
         i, weights, node = at
-        change = jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), slopes)
+        weighted = partial(jnp.tensordot, weights, axes=1)
+        change = jax.tree.map(weighted, slopes)
         (new, new_added), (value, dc) = evaluate(i, node, change)
         slopes = _with_row(slopes, new, i)
         added = _with_row(added, new_added, i)
-        return (slopes, added, jnp.where(i == 0, dc, first), value, dc), None
+        first_rates = jnp.where(i == 0, dc, first)
+        return (slopes, added, first_rates, value, dc), None
 
     tables = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), dtype), row)
     each = (
@@ -434,7 +451,8 @@ def _scanned(
         table,
         jnp.asarray(_NODES[:count], dtype),
     )
-    (slopes, added, *margins), _ = scan(stage, (*tables, none, none, none), each)
+    nothing_yet = (*tables, none, none, none)
+    (slopes, added, *margins), _ = scan(stage, nothing_yet, each)
     return [slopes, added], margins
 
 
@@ -460,9 +478,11 @@ def _written_out(
                 *(tables[0][j] for j in used),
             )
         node = jnp.asarray(_NODES[i], none.dtype)
-        new, margin = evaluate(jnp.asarray(i, jnp.uint32), node, change)
+        index = jnp.asarray(i, jnp.uint32)
+        new, margin = evaluate(index, node, change)
         for table, empty, part in zip(tables, row, new):
-            table.append(_with_row(empty, part, jnp.zeros((), jnp.uint32)))
+            row_of_stage = _with_row(empty, part, jnp.zeros((), jnp.uint32))
+            table.append(row_of_stage)
         margins.append(margin)
     whole = [jax.tree.map(lambda *x: jnp.concatenate(x), *table) for table in tables]
     _, first_rates = margins[0]
@@ -488,7 +508,8 @@ def _weighted(
         changes.append(change)
         errors.append(sums[1:])
     change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, *changes)
-    return change, value_of(length)[None] * jnp.concatenate(errors, axis=1)
+    of_rows = jnp.concatenate(errors, axis=1)
+    return change, value_of(length)[None] * of_rows
 
 
 def _with_row(table: Any, new: list[Any], i: Integer[Array, ""]) -> Any:
@@ -582,9 +603,11 @@ class StepperState(NamedTuple):
     def marked(self, which: Bool[Array, "1 B"], mark: Any) -> "StepperState":
         """The state with this `Mark` where `which` is True."""
         old = self.mark_as_float
-        new = jax.lax.stop_gradient(jnp.where(which, jnp.asarray(mark, old.dtype), old))
+        code = jnp.asarray(mark, old.dtype)
+        new = jax.lax.stop_gradient(jnp.where(which, code, old))
         row = slice(Progress.MARK, Progress.MARK + 1)
-        return self._replace(progress=self.progress.at[row].set(new))
+        marked_progress = self.progress.at[row].set(new)
+        return self._replace(progress=marked_progress)
 
 
 def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
@@ -597,14 +620,17 @@ def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
     flow, y = value_of((flow, start))
     one = jnp.ones_like(_row(y, 0))
     # xi = 0, a length in the root of time, no landing
-    clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
+    no = 0 * one
+    clock = jnp.concatenate([no, FIRST**0.5 * one, one, no])
     targets = jax.eval_shape(
         lambda: flow.margins(flow.constants(modes), modes, y)
     ).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
-    mark = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
-    progress = jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one])
+    code = jnp.where(over, Mark.OVER, Mark.GOES_ON)
+    mark = code.astype(y.dtype)
+    none_yet = 0 * one
+    progress = jnp.concatenate([FIRST * one, none_yet, mark, none_yet])
     return StepperState(start, step, progress)
 
 
@@ -638,7 +664,8 @@ def advance(
     events = s.target & (accept & lands)  # one-hot
     # the field has no value, however short the step: given up, and the status reports
     # it
-    broken = active & ~lands & ~(error2 < jnp.inf) & (s.length < SHORTEST)
+    no_value = ~(error2 < jnp.inf)
+    broken = active & ~lands & no_value & (s.length < SHORTEST)
 
     def after(
         flow: Flow, y: Float[Array, "n B"], change: Float[Array, "_ B"]
@@ -647,7 +674,8 @@ def advance(
         `broken`.
         """
         modes, end = flow.switch(s.modes, y + change[:n], events)
-        return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+        otherwise = jnp.where(broken, jnp.nan, y)
+        return modes, jnp.where(accept, end, otherwise)
 
     modes, end = pushforward(after, duals, start, change)
     end = dual_like(start, end)
@@ -658,11 +686,13 @@ def advance(
     if pauses is not None:
         mark = jnp.where(active & pauses, Mark.PAUSED, mark)
     over = flow.over(modes, value_of(end), passes) | broken
-    aimed_twice = (step.lands > 0) & lands & (urgent.intention < Intention.AHEAD)
+    not_ahead = urgent.intention < Intention.AHEAD
+    aimed_twice = (step.lands > 0) & lands & not_ahead
     mark = jnp.where(over, Mark.OVER, mark)
     rows = [next_duration, aimed_twice.astype(y.dtype), mark, passes]
     progress = jnp.concatenate(rows)
-    return StepperState(end, *jax.lax.stop_gradient((step, progress))), accept
+    planned = jax.lax.stop_gradient((step, progress))
+    return StepperState(end, *planned), accept
 
 
 def _squared_error(
@@ -679,11 +709,15 @@ def _squared_error(
     """
     zero = precision(y.dtype)
     full = FULL * flow.taking_part
-    local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), zero.noise)
-    scale = local * flow.allowance(s.modes, y) + zero.accumulated * jnp.abs(y)
-    fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
+    share = full / jnp.maximum(passes, full)
+    local = jnp.maximum(flow.tolerance * share, zero.noise)
+    allowed = local * flow.allowance(s.modes, y)
+    scale = allowed + zero.accumulated * jnp.abs(y)
+    largest = jnp.max(jnp.abs(errors) / scale[None], axis=1)
+    fifth, third = (x[None] for x in largest)
     # 0.01 is Hairer's; `tiny`: a landing of length 0 has no errors
-    error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + zero.tiny)
+    square = fifth**2 + 0.01 * third**2 + zero.tiny
+    error2 = fifth**4 / square
     # small by chance where the fifth order is: a landing from a maximum, a step of half
     # a period
     return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
@@ -707,7 +741,8 @@ class _Course(NamedTuple):
         c0, c1, d0, d1 = self
         v = 1 - u
         from_start = (c0 * (1 + 2 * u) + d0 * u) * v * v
-        return from_start + (c1 * (1 + 2 * v) - d1 * v) * u * u
+        from_end = (c1 * (1 + 2 * v) - d1 * v) * u * u
+        return from_start + from_end
 
 
 def _intentions(
@@ -724,16 +759,19 @@ def _intentions(
     zero = flow.zero_margin
     free = ~s.target
     crossed = free & (c1 < -zero)
-    turns = free & (d0 < 0) & (d1 > 0) & (c0 > zero)
+    falls_then_rises = (d0 < 0) & (d1 > 0)
+    turns = free & falls_then_rises & (c0 > zero)
     place = _place_within(flow, crossed, course)
-    dips = turns & (course.at(place) < DOUBT * (d1 - d0) - zero)
+    doubtful = DOUBT * (d1 - d0) - zero
+    dips = turns & (course.at(place) < doubtful)
     at_once = (c0 <= zero) & (d0 <= 0)
     if flow.near:
         direct = at_once
     else:
         direct = at_once | ((d0 < 0) & (c0 > zero))
     direct = direct & (aimed_twice == 0)
-    ahead = _distance_ahead(zero, free & ~turns & ~(s.lands > 0), course)
+    steps_in_time = ~(s.lands > 0)
+    ahead = _distance_ahead(zero, free & ~turns & steps_in_time, course)
     intention = jnp.where(dips, Intention.SHORTEN, Intention.AHEAD)
     crossing = jnp.where(direct, Intention.LAND, Intention.SHORTEN)
     intention = jnp.where(crossed, crossing, intention)
@@ -752,7 +790,8 @@ def _distance_ahead(
     """
     _, c1, d0, d1 = course
     discriminant = d1 * d1 - 2 * (d1 - d0) * c1
-    ahead = which & (d1 < 0) & (c1 > zero) & (discriminant > 0)
+    falls = (d1 < 0) & (c1 > zero)
+    ahead = which & falls & (discriminant > 0)
     root = jnp.sqrt(jnp.where(ahead, discriminant, 1.0))
     w = 2 * c1 / (root - jnp.where(ahead, d1, 0.0))
     return jnp.where(ahead, w, jnp.inf)
@@ -776,8 +815,10 @@ def _place_within(
     u = part / jnp.where(whole > 0, whole, jnp.inf)
     rises = crossed & (d0 > 0)
     bend = jnp.where(rises, above + d0 - c1, 1.0)
-    root = jnp.sqrt(jnp.where(rises, d0 * d0 + 4 * bend * above, 1.0))
-    u = jnp.where(rises, (d0 + root) / (2 * bend), u)
+    square = jnp.where(rises, d0 * d0 + 4 * bend * above, 1.0)
+    root = jnp.sqrt(square)
+    zero_of_parabola = (d0 + root) / (2 * bend)
+    u = jnp.where(rises, zero_of_parabola, u)
     if flow.near:
         # a step in time precedes the landing: dt/dxi is singular at the top of a
         # parabola
@@ -800,7 +841,8 @@ def _most_urgent(
     the row.
     """
     # below 0: SHORTEN; from 0 to 1: LAND at this part of the step; above: AHEAD
-    tie = TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
+    row = jnp.arange(len(distance), dtype=distance.dtype)
+    tie = TIE * row[:, None]
     order = intention + distance + tie
     first = jnp.min(order, axis=0, keepdims=True)
     not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
@@ -827,7 +869,8 @@ def _next_step(
     event = urgent.intention < Intention.AHEAD
     # xi goes on from the end of an accepted step
     in_root = (s.in_root > 0) & ~lands
-    start = jnp.where(in_root, s.start + jnp.where(accept, length, 0.0), 0.0)
+    passed = jnp.where(accept, length, 0.0)
+    start = jnp.where(in_root, s.start + passed, 0.0)
     # the length: shorter before an event or after a failed landing, else by the error
     shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
     at_event = jnp.where(urgent.intention == Intention.SHORTEN, shorter, length)
@@ -838,12 +881,15 @@ def _next_step(
     in_root = in_root | closed
     start = jnp.where(closed, 0.0, start)
     proposed = _restart_in_root(closed, duration, proposed)
-    proposed = jnp.where(in_root, proposed, jnp.minimum(proposed, flow.longest))
+    in_time = jnp.minimum(proposed, flow.longest)
+    proposed = jnp.where(in_root, proposed, in_time)
     # xi is the root of time: from `start` on a step takes this long
-    expected = jnp.where(in_root, (start + proposed) ** 2 - start**2, proposed)
+    time_in_root = (start + proposed) ** 2 - start**2
+    expected = jnp.where(in_root, time_in_root, proposed)
     # the next step is a landing, in time, if one is due now or ahead
     reached = _reaches_event(flow, s.modes, urgent.distance, duration, expected)
-    aim = ok & jnp.where(event, urgent.intention == Intention.LAND, ~lands & reached)
+    due = urgent.intention == Intention.LAND
+    aim = ok & jnp.where(event, due, ~lands & reached)
     proposed = jnp.where(aim & in_root, expected, proposed)
     in_root = in_root & ~aim
     flags = [x.astype(length.dtype) for x in (in_root, aim)]
@@ -928,7 +974,8 @@ def _root_of_cubic(u: Float[Array, "k B"], course: _Course) -> Float[Array, "k B
         bend = v * a + u * b
         value = v * c0 + u * c1 + u * v * bend
         slope = rise + (v - u) * bend + u * v * (b - a)
-        u = jnp.clip(u - value / jnp.where(slope < 0, slope, -jnp.inf), 0.0, 1.0)
+        falling = jnp.where(slope < 0, slope, -jnp.inf)
+        u = jnp.clip(u - value / falling, 0.0, 1.0)
     return u
 
 
@@ -944,10 +991,13 @@ def between(
     start = s.start * in_root
     reached = start**2 + ahead
     positive = reached > 0
-    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
+    square = jnp.where(positive, reached, 1.0)
+    root = jnp.where(positive, jnp.sqrt(square), 0.0)
     h = jnp.where(in_root > 0, root - start, ahead)
-    clock = jnp.concatenate([start, h, in_root, jnp.zeros_like(h)])
-    return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
+    no_landing = jnp.zeros_like(h)
+    clock = jnp.concatenate([start, h, in_root, no_landing])
+    no_target = jnp.zeros_like(s.target)
+    return step_again(flow, Step(s.modes, no_target, clock), y)
 
 
 def step_again(flow: Flow, s: Step, y: Float[Array, "n B"]) -> Float[Array, "n B"]:

@@ -27,10 +27,11 @@ class TangentialBlock(NamedTuple):
         well.
         """
         of_tangents = per_tangent(root, self.slip)
+        of_pairs = root[:, None] * of_tangents[None]
+        squares = of_tangents[:, None] * of_tangents[None]
+        slip = self.slip / (of_tangents * speed)
         return TangentialBlock(
-            self.normal_tangent / (root[:, None] * of_tangents[None]),
-            self.tangent / (of_tangents[:, None] * of_tangents[None]),
-            self.slip / (of_tangents * speed),
+            self.normal_tangent / of_pairs, self.tangent / squares, slip
         )
 
 

@@ -69,9 +69,8 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     def of_values(*values: jax.Array) -> list[Any]:
         """Leaves of the results, as a function of the values of the duals alone."""
         replaced = dict(zip(duals, values))
-        args = jax.tree.unflatten(
-            tree, [replaced.get(i, x) for i, x in enumerate(leaves)]
-        )
+        replaced_leaves = [replaced.get(i, x) for i, x in enumerate(leaves)]
+        args = jax.tree.unflatten(tree, replaced_leaves)
         results, result_tree = jax.tree.flatten(function(*args))
         trees[:] = [result_tree]
         depends[:] = [False] * len(results)
@@ -87,7 +86,8 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
         return results, [rate for rate, needed in zip(rates, depends) if needed]
 
     directions = (leaves[i].tangents for i in duals)
-    results, found = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))(*directions)
+    in_lanes = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))
+    results, found = in_lanes(*directions)
     rates = iter(found)
     return jax.tree.unflatten(
         trees[0],
@@ -106,11 +106,13 @@ def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
     """x as a `Dual` with tangents of 0 if a leaf of the tree is a `Dual`, otherwise
     x.
     """
-    duals = [leaf for leaf in jax.tree.leaves(tree, is_leaf=is_dual) if is_dual(leaf)]
+    leaves = jax.tree.leaves(tree, is_leaf=is_dual)
+    duals = [leaf for leaf in leaves if is_dual(leaf)]
     if not duals or isinstance(x, Dual):
         return x
     directions = duals[0].tangents.shape[TANGENT_AXIS]
-    none = jnp.zeros((*x.shape[:-1], directions, x.shape[-1]), x.dtype)
+    shape = (*x.shape[:-1], directions, x.shape[-1])
+    none = jnp.zeros(shape, x.dtype)
     return Dual(x, varying_like(none, duals))
 
 

@@ -11,9 +11,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jimpact.numerics.sparse import Neighbours, Sparse
 
-# of one row: diagonal entry, right side, off-diagonal entry to the next row
-Triple = tuple[jax.Array, jax.Array, jax.Array]
-
 
 def tridiagonal_product(
     on_diagonal: Float[Array, "m *#B"],
@@ -45,60 +42,22 @@ class Tridiagonal(eqx.Module):
         vector = jnp.asarray(vector)
         return tridiagonal_product(self.diagonal * vector, self.off_diagonal, vector)
 
-    def solve(self, vector: Float[Array, " m"]) -> Float[Array, " m"]:
-        """`A^-1 vector` for a positive definite matrix, in O(m), by elimination without
-        pivots.
-        """
-        none = jnp.zeros_like(vector[:1])
-        first = jnp.ones_like(none), none, none
-
-        def eliminate(row: Triple, entries: Triple) -> tuple[Triple, Triple]:
-            """Row j of the bidiagonal system from row j - 1, f = o_j-1 / d_j-1, twice.
-
-            Equation: `d_j - f o_j-1` on the diagonal, right side `r_j - f r_j-1`.
-            """
-            pivot, right, before = row  # of the row above, and its off-diagonal entry
-            diagonal = entries[0][None]
-            known = entries[1][None]
-            after = entries[2][None]
-            factor = before / pivot
-            reduced = diagonal - factor * before, known - factor * right, after
-            return reduced, reduced
-
-        after = jnp.concatenate([self.off_diagonal, none])
-        _, (pivot, right, after) = jax.lax.scan(
-            eliminate, first, (self.diagonal, vector, after)
-        )
-
-        def substitute(
-            x: Float[Array, "1"], row: Triple
-        ) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-            """Unknown `x_j = (r_j - o_j x_j+1) / d_j` of the bidiagonal system,
-            twice.
-            """
-            pivot, right, after = row
-            x = (right - after * x) / pivot
-            return x, x
-
-        rows = pivot, right, after
-        return jax.lax.scan(substitute, none, rows, reverse=True)[1].reshape(
-            vector.shape
-        )
-
     def __abs__(self) -> "Tridiagonal":
         """|A|, entry by entry."""
-        return Tridiagonal(
-            jnp.abs(self.diagonal), jnp.abs(self.off_diagonal), self.regular
-        )
+        entries = jnp.abs(self.off_diagonal)
+        return Tridiagonal(jnp.abs(self.diagonal), entries, self.regular)
 
     def as_matrix(self) -> Float[Array, "m m *B"]:
         """The dense matrix."""
         m = self.diagonal.shape[0]
         i = jnp.arange(m)
-        dense = jnp.zeros((m, m, *self.diagonal.shape[1:]), self.diagonal.dtype)
+        batch = self.diagonal.shape[1:]
+        dense = jnp.zeros((m, m, *batch), self.diagonal.dtype)
         dense = dense.at[i, i].set(self.diagonal)
-        dense = dense.at[i[:-1], i[1:]].set(self.off_diagonal)
-        return dense.at[i[1:], i[:-1]].set(self.off_diagonal)
+        upper = i[:-1], i[1:]
+        dense = dense.at[upper].set(self.off_diagonal)
+        lower = i[1:], i[:-1]
+        return dense.at[lower].set(self.off_diagonal)
 
     def scaled(self, scale: Float[Array, " m"]) -> "Tridiagonal":
         """`diag(scale) A diag(scale)`."""
