@@ -51,15 +51,6 @@ ROBUST = 1.5  # first value of the implicit method
 SCENES = (*spatial_scenes.NAMED, "plane, 2 contacts")
 CUBES = {"cube corner": 1, "cube edge": 2, "cube flat": 4}
 HELD = Path(__file__).parent.parent / "held" / "friction_space.npz"
-INPUTS = (
-    "mass",
-    "normals",
-    "tangents",
-    "velocity",
-    "restitution",
-    "friction",
-    "stiffness",
-)
 SHARP = 1e-3  # slopes are compared where lower differences agree to this: no kink in between
 KINDS = (*spatial_scenes.KINDS, *CUBES)
 
@@ -367,7 +358,9 @@ def agree(method, contacts):
         slopes, (v, status) = jax.jacfwd(after, has_aux=True)(jnp.zeros(3))
         return v, slopes.T, status
 
-    v, slopes, status = jax.jit(jax.vmap(one))(*(held[name] for name in INPUTS))
+    v, slopes, status = jax.jit(jax.vmap(one))(
+        *(held[name] for name in spatial_scenes.INPUTS)
+    )
     ends = ~np.array([ji.STATUS[int(s)].failure for s in status])
     error = np.abs(v - held["after"]).max(axis=1)[ends]
     wrong = np.abs(slopes - held["slopes"]).max(axis=2)

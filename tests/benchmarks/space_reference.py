@@ -30,20 +30,11 @@ EXPONENT = 1.5
 EPS, EPS_OF_SLOPES = 1e-6, 1e-7  # over the fastest approach
 RTOL = 1e-10
 STEP = 1e-3  # of the differences, in mu, e and ln k
-INPUTS = (
-    "mass",
-    "normals",
-    "tangents",
-    "velocity",
-    "restitution",
-    "friction",
-    "stiffness",
-)
 OUTPUTS = ("after", "uncertainty", "slopes", "slope_uncertainty")
 
 
 def impacts(contacts):
-    """Rows of INPUTS: boxes, and the cube where the file has such impacts."""
+    """Rows of `INPUTS`: boxes, and the cube where the file has such impacts."""
     rng, rows = np.random.default_rng([7, contacts]), []
     for kind in KINDS[contacts]:
         draw = spatial_scenes.random_boxes(kind, BOXES // len(KINDS[contacts]), seed=7)
@@ -90,7 +81,7 @@ def main():
             rows = impacts(contacts)
             outcomes = list(pool.map(solved, rows))
             columns = [*zip(*rows), *zip(*outcomes)]
-            for name, column in zip((*INPUTS, *OUTPUTS), columns):
+            for name, column in zip((*spatial_scenes.INPUTS, *OUTPUTS), columns):
                 table[f"{name}_{contacts}"] = np.stack(column)
             np.savez_compressed(DATA, **table)
             print(contacts, table[f"uncertainty_{contacts}"])

@@ -14,6 +14,16 @@ CUBE_CSV = Path(__file__).parents[1] / "held" / "cube_impacts.csv"
 CUBE_MASS, CUBE_INERTIA = 0.37, (9.57e-4, 9.57e-4, 9.09e-4)  # kg, kg m^2
 CUBE_HALF, CUBE_CENTRE, CUBE_LOW = 0.0474, 0.0057, 0.0036  # m
 CUBE_MU = (0.16, 0.3, 0.6)
+# arrays of held/friction_space.npz: the arguments of an impact
+INPUTS = (
+    "mass",
+    "normals",
+    "tangents",
+    "velocity",
+    "restitution",
+    "friction",
+    "stiffness",
+)
 CORNERS = np.array(
     [[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)]
 )

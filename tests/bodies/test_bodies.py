@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import piles
 import pytest
+from refusals import argument
 from scipy.spatial.transform import Rotation
 
 import jimpact as ji
@@ -43,9 +44,7 @@ def test_two_corners_have_a_range():
     assert block.gap_function(block.touching()).shape == (2,)
     assert float(block.valid(block.touching(0.3))) > 0
     fallen = jnp.array([0.0, 0.45, np.pi / 2])
-    with pytest.raises(
-        ValueError, match=r"`q` must be in the range.*corners='all'.*-0\.05"
-    ):
+    with pytest.raises(ValueError, match=argument("q", "-0.05")):
         block.scene(fallen)
 
     @jax.jit
@@ -489,14 +488,10 @@ def test_turning_is_exact(brick):
 @pytest.mark.slow
 def test_a_quaternion_must_have_length_one():
     ball = ji.Sphere(0.1)
-    with pytest.raises(
-        ValueError, match=r"`quaternion` must have length 1, but has length 2"
-    ):
+    with pytest.raises(ValueError, match=argument("quaternion")):
         ball.touching([2.0, 0, 0, 0])
     q = ball.touching()
-    with pytest.raises(
-        ValueError, match=r"`q` must be in the range .*a quaternion of length 1"
-    ):
+    with pytest.raises(ValueError, match=argument("q")):
         ball.scene(q.at[3].set(1.01))
 
     @jax.jit
@@ -546,17 +541,13 @@ def test_every_body_can_be_drawn():
 
 
 def test_bodies_without_contacts_and_gaps_of_another_shape_are_refused():
-    with pytest.raises(
-        ValueError, match=r"m >= 1 contacts of Bodies, but it returns \(0,\)"
-    ):
+    with pytest.raises(ValueError, match=argument("gap_function")):
         piles.discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
-    with pytest.raises(
-        ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"
-    ):
+    with pytest.raises(ValueError, match=argument("gap_function")):
         ji.scene_from_gaps(lambda q: q[None], [1.0], [0.5])
 
 
 @pytest.mark.parametrize("q", [[0.0, 1.0, 0.0], np.zeros((0, 3))])
 def test_scenes_need_rows_of_configurations(q):
-    with pytest.raises(ValueError, match=r"`q` must have shape \(K, d\)"):
+    with pytest.raises(ValueError, match=argument("q")):
         ji.Block(1.0, 2.0).scenes(q)

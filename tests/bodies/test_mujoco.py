@@ -6,6 +6,7 @@ import warnings
 import mujoco
 import numpy as np
 import pytest
+from refusals import argument
 
 import jimpact as ji
 
@@ -166,7 +167,7 @@ def test_balls_that_touch_but_for_rounding_touch():
 
 def test_a_margin_finds_gaps():
     model, data = load("".join(slider(i, 0.1001 * i) for i in range(3)))
-    with pytest.raises(ValueError, match="no geoms touch"):
+    with pytest.raises(ValueError, match=argument("data")):
         ji.from_mujoco(model, data)
     world = ji.from_mujoco(model, data, margin=1e-3)
     np.testing.assert_allclose(world.scene.gaps, 1e-4, rtol=1e-9)
@@ -295,18 +296,14 @@ def test_contacts_without_friction_have_none():
 def test_errors_name_the_argument(monkeypatch):
     model, data = load(body("0 0 .2", BOX))
     other = mujoco.MjData(load(LINKED)[0])
-    with pytest.raises(
-        ValueError, match="`data` must be of this model, with 7 positions"
-    ):
+    with pytest.raises(ValueError, match=argument("data")):
         ji.from_mujoco(model, other)
-    with pytest.raises(
-        TypeError, match=r"`model` and `data` must be a mujoco\.MjModel"
-    ):
+    with pytest.raises(TypeError, match=argument("model")):
         ji.from_mujoco("robot.xml", data)
     with pytest.raises(ValueError, match="margin"):
         ji.from_mujoco(model, data, margin=-1.0)
     data.qpos[0] = np.nan
-    with pytest.raises(ValueError, match=r"`data\.qpos`.* must be finite"):
+    with pytest.raises(ValueError, match=argument("data.qpos", "nan")):
         ji.from_mujoco(model, data)
     data.qpos[0] = 0.0
     monkeypatch.setitem(sys.modules, "mujoco", None)

@@ -127,10 +127,10 @@ def test_momentum_is_judged_by_the_covariance():
         PAIR,
         ji.Experiments(**data, covariance=np.tile(against, (COUNT, 1, 1))),
     )
-    assert any("conservation of momentum" in line for line in alarmed.warnings)
+    assert alarmed.found("momentum")
     loose = ji.Experiments(**data, covariance=np.tile(1e-2 * np.eye(4), (COUNT, 1, 1)))
     calm = ji.fit(ji.Newton(0.8), PAIR, loose)
-    assert not any("conservation of momentum" in line for line in calm.warnings)
+    assert not calm.found("momentum")
 
 
 @pytest.mark.parametrize(

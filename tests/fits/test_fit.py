@@ -11,6 +11,7 @@ import optax
 import pytest
 from fit_cases import BALLS, PAIR, PRE_3, SHOTS, THREE, Coupled, simulated, two_thirds
 from programs import CODE, as_matrix
+from refusals import argument
 from scipy import stats
 
 import jimpact as ji
@@ -89,8 +90,10 @@ def test_corrected_momentum_costs_degrees_of_freedom():
     assert ji.fit(ji.Newton(0.9), PAIR, data).degrees_of_freedom == 8 - 4 - 1
 
 
-def reported(found):
-    return " ".join(found.warnings)
+def finding(found, kind):
+    """The one finding of this kind."""
+    (one,) = (each for each in found.findings if each.kind == kind)
+    return one
 
 
 @pytest.mark.slow
@@ -103,10 +106,11 @@ def test_data_that_another_law_made_are_reported():
     ):
         post = simulated(ji.Newton([0.9, 0.4]), scene, pre[:, : scene.size], noise=0.01)
         data = ji.Experiments(pre[:, : scene.size], post)
-        assert reason in reported(ji.fit(ji.Newton(0.8), scene, data))
+        wrong = ji.fit(ji.Newton(0.8), scene, data)
+        assert reason in finding(wrong, "lack_of_fit").line
         right = ji.fit(ji.Newton([0.8, 0.8]), scene, data)
-        assert "Lack of fit" not in reported(right)
-        assert "Suspicious" not in reported(right)
+        assert not right.found("lack_of_fit")
+        assert not right.found("suspicious")
 
 
 def test_lack_of_fit_is_reported_from_its_level_on():
@@ -126,8 +130,8 @@ def test_lack_of_fit_is_reported_from_its_level_on():
     left = np.sum(fit(1.0).residual ** 2) - np.sum(momentum**2)
     ratio = left / 23 / (np.sum(momentum**2) / 12)
     edge = np.sqrt(stats.f.isf(0.01, 23, 12) / ratio)
-    assert "noise that momentum" not in reported(fit(0.98 * edge))
-    assert "noise that momentum" in reported(fit(1.02 * edge))
+    assert not fit(0.98 * edge).found("lack_of_fit")
+    assert fit(1.02 * edge).found("lack_of_fit")
 
 
 WALLED = ji.chain([1.0, 2.0], wall=True)
@@ -138,7 +142,7 @@ def test_honest_noise_breaks_no_momentum():
     post = simulated(ji.Newton(0.98), PAIR, pre, noise=0.02)
     assert ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)).warnings == ()
     broken = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post))
-    assert "violate conservation of momentum" in reported(broken)
+    assert len(finding(broken, "momentum").shots) == 24
     assert (
         "; but the data violate conservation of momentum in all 24 shots"
         in broken.verdict
@@ -151,13 +155,13 @@ def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
     post[17] += [0.8, -0.4]  # momentum is conserved
     data = ji.Experiments(pre, post)
     moved = ji.fit(ji.Newton(0.5), PAIR, data)
-    assert "Suspicious: shot 18," in reported(moved)
+    assert finding(moved, "suspicious").shots == ("18",)
     assert abs(moved.value[0] - 0.9) > 0.02
     for loss in ("huber", "student"):
         found = ji.fit(ji.Newton(0.5), PAIR, data, search=ji.Search(loss=loss))
         assert abs(found.value[0] - 0.9) < 0.005
         assert abs(found.value[0] - 0.9) < 4 * found.standard_error[0] < 0.02
-        assert "Suspicious: shot 18," in reported(found)
+        assert finding(found, "suspicious").shots == ("18",)
         assert found.verdict.endswith("; and shot 18 is suspicious.")
 
 
@@ -188,10 +192,9 @@ def test_honest_shots_are_seldom_suspicious():
             size=(24, 2)
         )
         data = ji.Experiments(pre, post)
-        named += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, data))
-        outvoted += "Suspicious" in reported(
-            ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(loss="huber"))
-        )
+        named += ji.fit(ji.Newton(0.9), PAIR, data).found("suspicious")
+        robust = ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(loss="huber"))
+        outvoted += robust.found("suspicious")
     assert named <= 3
     assert outvoted <= 3
 
@@ -250,29 +253,26 @@ def test_the_scale_of_robust_losses_is_that_of_normal_errors():
 
 def test_swapped_velocities_are_reported():
     post = simulated(ji.Newton(0.9), PAIR, SHOTS)
-    assert "No contact approaches in 4 of 4 shots" in reported(
-        ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(post, SHOTS), starts=1)
-    )
+    swapped = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(post, SHOTS), starts=1)
+    assert len(finding(swapped, "no_approach").shots) == 4
 
 
 def test_shots_in_which_only_open_contacts_approach_are_reported():
     """By a law without gaps; with them nothing is wrong."""
     apart = ji.chain([1.0, 1.0], gaps=[1e-3])
     data = ji.Experiments(SHOTS, simulated(ji.Binary(0.8), apart, SHOTS), sigma=0.01)
-    assert "only open ones do" in reported(
-        ji.fit(ji.Newton(0.9), apart, data, starts=1)
-    )
-    assert "approaches" not in reported(ji.fit(ji.Binary(0.9), apart, data, starts=1))
+    assert ji.fit(ji.Newton(0.9), apart, data, starts=1).found("no_approach")
+    assert not ji.fit(ji.Binary(0.9), apart, data, starts=1).found("no_approach")
 
 
 def test_copies_of_a_shot_are_reported():
     pre = np.tile([[1.0, 0.0]], (6, 1))
     post = np.tile([[-0.2, 0.6]], (6, 1))
     copies = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
-    assert "All 6 shots are equal" in reported(copies)
+    assert len(finding(copies, "copies").shots) == 6
     times = np.array([[1.0]] * 5 + [[2.0]])
     scaled = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(times * pre, times * post))
-    assert "All 6 shots are equal" in reported(scaled)
+    assert len(finding(scaled, "copies").shots) == 6
     assert np.isnan(
         [*scaled.standard_error, scaled.noise]
     ).all()  # reproduced to the last digit
@@ -280,7 +280,7 @@ def test_copies_of_a_shot_are_reported():
     assert scaled.verdict == f"restitution = 0.8, {reserved}."
     post[1:4] += [[0.01, -0.005], [0.02, 0.0], [0.0, 0.01]]
     spread = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
-    assert "shots are equal" not in reported(spread)
+    assert not spread.found("copies")
     assert np.isfinite(spread.standard_error).all()
 
 
@@ -290,8 +290,8 @@ def test_readings_that_repeat_hide_the_noise():
     post = np.array([[0.10, 0.90]] * 7 + [[0.21, 1.79]])
     data = ji.Experiments(speed * [1.0, 0.0], post)
     repeated = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
-    assert "Lack of fit" not in reported(repeated)
-    assert "7 of 8 shots are equal to the last digit" in reported(repeated)
+    assert not repeated.found("lack_of_fit")
+    assert len(finding(repeated, "copies").shots) == 7
     assert repeated.verdict.endswith("; but 7 of 8 shots are copies of one.")
 
 
@@ -313,7 +313,7 @@ def fitted_without_the_third_shot(law):
     slow = [0, 1, 3]
     found = ji.fit(law, PAIR, ji.Experiments(SHOTS, post))
     expected = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[slow], post[slow]))
-    assert "Left out: 1 of 4 shots (3)" in reported(found)
+    assert finding(found, "left_out").shots == ("3",)
     assert "1 of 4 shots are left out" in found.reservations
     np.testing.assert_allclose(found.value, expected.value, rtol=1e-6)
     return found
@@ -341,13 +341,11 @@ def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
     problem = ji.FitProblem.from_observable(
         ji.Newton(0.9), lambda law: jnp.sqrt(0.0 * law.restitution)[None], [0.1]
     )
-    with pytest.raises(
-        ValueError, match=r"at restitution = 0.9 those of 1 measured values \(1\)"
-    ):
+    with pytest.raises(ValueError, match=argument("law")):
         ji.fit(problem)
     with pytest.raises(
         ValueError,
-        match="`bounds`, `priors` and `ties` must be left out where a FitProblem is given",
+        match=argument("bounds"),
     ):
         ji.fit(problem, bounds={"restitution": (0.5, 1.0)})
 
@@ -366,9 +364,7 @@ def test_one_shot_that_gains_energy_is_named():
     assert not quiet.found("energy_gain")
     after[6] += before[6] * np.array([-0.2, 0.1])
     found = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, after))
-    (gain,) = (each for each in found.findings if each.kind == "energy_gain")
-    assert gain.shots == ("7",)
-    assert gain.line.startswith("The data gain energy (1 = conserved): shot 7: ")
+    assert finding(found, "energy_gain").shots == ("7",)
 
 
 def test_turning_weighs_by_kinetic_energy():
@@ -382,7 +378,7 @@ def test_turning_weighs_by_kinetic_energy():
         ji.Newton(0.8), scene, ji.Experiments(pre, post, sigma=[[1.0, 10.0]] * 3)
     )
     np.testing.assert_allclose(found.value, same.value, rtol=1e-8)
-    assert "same kinetic energy" in reported(found)
+    assert found.found("mixed_units")
     assert " rad/s" in str(found)
 
 
@@ -443,7 +439,6 @@ def test_too_few_steps_are_reported():
     )
     assert not found.converged
     assert found.found("not_converged")
-    assert "NOT converged" in str(found)
 
 
 def test_carts_that_stick_end_at_the_bound():
@@ -452,8 +447,8 @@ def test_carts_that_stick_end_at_the_bound():
         found = ji.fit(law, ji.chain([0.34175, 0.15449]), data)
         assert float(found.law.restitution) == 0.0
         assert found.at_bound[0]
-        assert "restitution is at its lower bound 0" in " ".join(found.warnings)
-        assert "The data violate conservation of momentum" in found.warnings[0]
+        assert found.found("at_bound")
+        assert found.found("momentum")
         assert found.confidence_interval()[0, 0] == 0.0
 
 
@@ -626,7 +621,7 @@ def test_parameters_by_name_and_criteria():
     likelihood = stats.norm.logpdf(unknown.residual, scale=unknown.rms).sum()
     constant = 8 * (1 + np.log(2 * np.pi))
     np.testing.assert_allclose(unknown.aic, 4 - 2 * likelihood - constant, rtol=1e-10)
-    with pytest.raises(ValueError, match="`name` must be one of restitution"):
+    with pytest.raises(ValueError, match=argument("name", "'stiffness'")):
         known["stiffness"]
 
 
@@ -728,7 +723,7 @@ def test_a_prior_that_the_data_contradict_is_named():
     for far, named in ((2.5, False), (2.65, True)):
         mean = e + far * np.hypot(error, std)
         found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (mean, std)})
-        assert (f"is {far:.2g} standard errors off" in reported(found)) is named
+        assert bool(found.found("prior")) is named
         assert (
             "the prior of restitution contradicts the data" in found.verdict
         ) is named
@@ -904,7 +899,7 @@ def test_an_observable_that_is_no_number_is_reported(lost):
     found = ji.fit(
         ji.FitProblem.from_observable(ji.Newton(0.9), observe, [0.5, 0.4], 0.01)
     )
-    assert f"fails in {lost} of 2 values (1" in found.warnings[0]
+    assert found.found("law_fails")
     amount = "some" if lost == 1 else "all"
     assert found.verdict.startswith(f"Newton fails in {amount} of these data")
     assert np.isnan(found.rms) == (lost == 2)
@@ -1043,10 +1038,7 @@ def test_a_lower_minimum_of_one_profile_is_that_of_all():
         assert scan.value[scan.deviance.argmin()] == value
         assert any(low <= value <= high for low, high in scan.intervals)
     warned = ji.fit(start, PAIR, data, ("root", "other"), starts=1, profiles=True)
-    assert (
-        "A profile found a lower minimum than the fit (root 0.8, other 0.05)"
-        in reported(warned)
-    )
+    assert warned.found("lower_minimum")
 
 
 def test_profile_of_a_valley_is_what_the_bounds_leave_of_it():
@@ -1097,7 +1089,7 @@ def test_contour_of_a_valley_is_its_length():
     thin = ji.fit(
         Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-4), ("one", "other")
     )
-    with pytest.raises(ValueError, match="falls between 4 values"):
+    with pytest.raises(ValueError, match=argument("points")):
         ji.contour(thin, "one", "other", points=4)
     data = ji.Experiments(SHOTS[:1], post, 0.05)
     found = ji.fit(Shared(0.9, 0.9), PAIR, data, ("one", "other"), profiles=False)
@@ -1138,17 +1130,15 @@ def test_bad_profiles(options, message):
         starts=1,
         search=ji.Search(loss="huber"),
     )
-    with pytest.raises(ValueError, match="by least squares"):
+    with pytest.raises(ValueError, match=argument("fit")):
         ji.profile(robust)
 
 
 def test_fits_under_transformations_are_refused_in_words():
     data = ji.Experiments(SHOTS, SHOTS)
-    with pytest.raises(
-        TypeError, match="`law` must hold numbers, but is traced: fits run on"
-    ):
+    with pytest.raises(TypeError, match=argument("law")):
         jax.grad(lambda e: ji.fit(ji.Newton(e), PAIR, data).rms)(0.5)
-    with pytest.raises(TypeError, match="`post` must hold numbers, but is traced"):
+    with pytest.raises(TypeError, match=argument("post")):
         jax.vmap(lambda post: ji.Experiments(SHOTS, post).post)(jnp.ones((2, 4, 2)))
 
 
@@ -1182,7 +1172,7 @@ def test_every_shot_is_predicted_from_the_others():
         expected = simulated(ji.Newton(e), PAIR, SHOTS[k : k + 1])[0]
         np.testing.assert_allclose(left.predicted[k], expected, atol=2 * near)
     one = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[:1], post[:1]), starts=1)
-    with pytest.raises(ValueError, match="at least 2 shots"):
+    with pytest.raises(ValueError, match=argument("fit")):
         ji.leave_one_out(one)
 
 
@@ -1201,10 +1191,10 @@ def test_bootstrap_scatters_as_much_as_the_standard_error():
         ji.bootstrap(found, samples=400, workers=1).value, many.value
     )
     for workers in (0, -1, "all"):
-        with pytest.raises(ValueError, match="`workers` must be an int >= 1"):
+        with pytest.raises(ValueError, match=argument("workers")):
             ji.bootstrap(found, workers=workers)
     exact = ji.Experiments(SHOTS[:1], [[np.nan, 0.6]])
-    with pytest.raises(ValueError, match="must have a known noise"):
+    with pytest.raises(ValueError, match=argument("fit")):
         ji.bootstrap(ji.fit(ji.Newton(0.9), PAIR, exact, starts=1))
 
 
@@ -1235,7 +1225,7 @@ def test_a_fitted_law_that_fails_is_reported():
     truth = Coupled(jnp.array([[1.2, 0.0], [0.0, 1.2]]))  # gains energy
     data = ji.Experiments(pre, simulated(truth, BALLS, pre))
     found = ji.fit(truth, BALLS, data, {"matrix": [[1, 0], [0, 1]]}, starts=2)
-    assert "fails in 1 of 1 shots (1): energy_gain" in " ".join(found.warnings)
+    assert finding(found, "law_fails").shots == ("1",)
 
 
 def test_minima_that_fit_equally_well_are_reported():
@@ -1328,12 +1318,12 @@ def test_a_wrong_unit_is_said_before_the_search():
         UserWarning, match=r"momentum after is 1000 times .* mm/s in one of"
     ):
         found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), starts=1)
-    assert "the units are suspect" in found.reservations
+    assert found.found("units")
 
 
 def test_bad_level():
     found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1)
-    with pytest.raises(ValueError, match=r"`level` must lie in \(0, 1\)"):
+    with pytest.raises(ValueError, match=argument("level", "95")):
         found.confidence_interval(95)
 
 

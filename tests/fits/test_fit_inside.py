@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fit_cases import BALLS, PAIR, PRE_3, SHOTS, THREE, Coupled, simulated, two_thirds
+from refusals import argument
 from scipy import optimize
 
 import jimpact as ji
@@ -41,7 +42,7 @@ def test_entries_are_named_as_in_the_report():
     ):
         with pytest.raises(ValueError, match=message):
             free_parameters(law, free)
-    with pytest.raises(ValueError, match="one value for all contacts"):
+    with pytest.raises(ValueError, match=argument("free")):
         free_parameters(ji.Newton(0.8), "restitution[1]")
 
 
@@ -87,7 +88,7 @@ def test_a_mass_with_a_prior_is_fitted_with_the_law():
     np.testing.assert_allclose(
         found.predict(SHOTS).velocity, found.predicted, atol=1e-12
     )
-    with pytest.raises(ValueError, match="`scene` must be left out"):
+    with pytest.raises(ValueError, match=argument("scene")):
         found.predict(SHOTS, BALLS)
 
 
@@ -179,7 +180,7 @@ def test_a_kink_is_a_minimum_but_not_a_standard_error():
     problem = ji.FitProblem.from_observable(ji.Newton(0.5), bend, [0.0, 1.0], 0.1)
     found = ji.fit(problem, starts=1, profiles=False)
     np.testing.assert_allclose(found.value, 0.4, atol=1e-3)
-    assert "minimum is a kink of the law" in " ".join(found.warnings)
+    assert found.found("kink")
 
 
 def test_a_time_limit_ends_a_search():

@@ -15,6 +15,7 @@ from matrix_fit_cases import (
     fitted,
     shots,
 )
+from refusals import argument
 
 import jimpact as ji
 from jimpact import RestitutionMatrix, fit, read_study
@@ -35,9 +36,7 @@ def test_one_shot_is_always_reproduced():
         np.testing.assert_allclose(found.residual, 0, atol=1e-8)
         assert found.rank == 2
         assert "rms residual   0 (the values are reproduced)" in str(found)
-        assert any(
-            "Nothing keeps this matrix consistent" in line for line in found.warnings
-        )
+        assert found.found("matrix_free")
 
 
 @pytest.mark.slow
@@ -152,10 +151,10 @@ def test_a_start_whose_impulses_would_pull():
 def test_scenes_without_an_admissible_set():
     redundant = ji.Scene([1.0, 1.0], [[1.0, 1.0], [0.0, 0.0]])
     data = ji.Experiments([[-1.0, 0.0]], [[0.5, 0.0]])
-    with pytest.raises(ValueError, match="no redundant contacts"):
+    with pytest.raises(ValueError, match=argument("scene")):
         fit(RestitutionMatrix(START), redundant, data, {"matrix": True})
     eight = ji.Experiments([[1.0, 0, 0, 0, 0, 0, 0, 0]], [[0.0, 0, 0, 0, 0, 0, 0, 1.0]])
-    with pytest.raises(ValueError, match="at most 6 contacts"):
+    with pytest.raises(ValueError, match=argument("law")):
         fit(
             RestitutionMatrix(0.1 * np.eye(7)),
             ji.chain(jnp.ones(8)),
@@ -167,7 +166,7 @@ def test_scenes_without_an_admissible_set():
 def test_held_entries_that_leave_no_room():
     """Elastic first column: any entry more in the second would gain energy somewhere."""
     elastic = np.eye(2)
-    with pytest.raises(ValueError, match="must leave an admissible choice"):
+    with pytest.raises(ValueError, match=argument("free")):
         fitted(
             shots(E_TRUE), start=elastic, free=np.array([[False, True], [False, False]])
         )

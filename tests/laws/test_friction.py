@@ -1,10 +1,8 @@
 """Coulomb friction in every law that has it: closed forms, the law itself on random scenes, slopes.
 
-Two canonical shapes: planar, 4 coordinates and 2 contacts; in space 6 and 2. Fewer coordinates are
-joined by idle ones, a scene of one contact by a second one, open.
+The scenes run as lanes of two programs, see friction_programs.py.
 """
 
-import dataclasses
 import functools
 import itertools
 from pathlib import Path
@@ -13,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from friction_programs import LAWS, run
 from friction_reference import blocks, regularized, routh, small_steps
 from programs import CODE, OPTIMIZED, failed, names
 
@@ -20,80 +19,7 @@ import jimpact as ji
 
 close = np.testing.assert_allclose
 
-# (e, mu, e_t, k) -> law; e_t is of the kinematic laws, k of LZB
-LAWS = {
-    "newton": lambda e, mu, e_t, k: ji.Newton(
-        e, friction=mu, tangential_restitution=e_t
-    ),
-    "moreau": lambda e, mu, e_t, k: ji.Moreau(
-        e, friction=mu, tangential_restitution=e_t
-    ),
-    "matrix": lambda e, mu, e_t, k: ji.RestitutionMatrix(
-        jnp.diag(e), friction=mu, tangential_restitution=e_t
-    ),
-    "binary": lambda e, mu, e_t, k: ji.Binary(
-        e, "earliest", friction=mu, tangential_restitution=e_t
-    ),
-    "poisson": lambda e, mu, e_t, k: ji.Poisson(
-        e, friction=mu, tangential_restitution=e_t
-    ),
-    "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu, method="time"),
-    "compliant": lambda e, mu, e_t, k: ji.Compliant(
-        ji.Bistiffness(k, 1.5, e), friction=mu, method="time"
-    ),
-}
 KINEMATIC = ("newton", "moreau", "matrix", "binary")
-
-
-@functools.cache
-def program(name):
-    """Compiled once a shape: planar or in space."""
-
-    def one(mass, normals, tangents, gaps, v, e, mu, e_t, k):
-        scene = ji.Scene(mass, normals, tangents=tangents, gaps=gaps)
-        out = ji.impact(LAWS[name](e, mu, e_t, k), scene, v)
-        return out, ji.audit(out, scene, v)
-
-    # long runs: what compiling well takes is saved
-    options = OPTIMIZED if name in ("lzb", "compliant") else None
-    return jax.jit(jax.vmap(one), compiler_options=options)
-
-
-LANES = 64
-
-
-def run(name, mass, normals, tangents, v, e, mu, e_t=0.0, k=1.0):
-    """Outcomes of a batch; one contact is joined by an open one."""
-    count, n, m = np.shape(normals)
-    rows = np.shape(tangents)[2] // m
-    mass = np.asarray(mass, float)
-    mass = mass[:, :, None] * np.eye(n) if mass.ndim == 2 else mass
-    idle = (4 if rows == 1 else 6) - n
-    full = np.tile(np.eye(n + idle), (count, 1, 1))
-    full[:, :n, :n] = mass
-    mass = full
-    normals, tangents = (
-        np.pad(x, ((0, 0), (0, idle), (0, 0))) for x in (normals, tangents)
-    )
-    v = np.pad(v, ((0, 0), (0, idle)))
-    if m == 1:
-        normals, tangents = (
-            np.concatenate([x, x[:, :, :rows]], 2) for x in (normals, tangents)
-        )
-    # far from closing while the other one is indented: `compliant` would feel it
-    gaps = np.tile([0.0, 1e3 * (m == 1)], (count, 1))
-    per = [
-        np.broadcast_to(np.asarray(x, float).reshape(-1, *(1,) * (np.ndim(x) < 2), *np.shape(x)[1:]), (count, 2))
-        for x in (e, mu, e_t, k)
-    ]  # fmt: skip
-    columns = [np.asarray(x, float) for x in (mass, normals, tangents, gaps, v, *per)]
-    parts = []
-    for begin in range(0, count, LANES):
-        at = np.arange(begin, begin + LANES).clip(max=count - 1)
-        part = program(name)(*(x[at] for x in columns))
-        parts.append(jax.tree.map(lambda x, b=begin: np.asarray(x)[: count - b], part))
-    out, found = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return dataclasses.replace(out, velocity=out.velocity[:, :n]), found
 
 
 # ---------------------------------------------------------------------------- one contact

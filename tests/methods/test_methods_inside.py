@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from friction_reference import routh
 from methods_cases import BALLS, DISC, HERTZ, SLIDES, SLIP, STRIKE, rod
+from refusals import argument
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
@@ -173,9 +174,7 @@ def test_limits_are_of_the_unbroken_run_from_their_end():
 
 def test_a_contender_of_ones_own_has_a_name_of_its_own():
     mine = CONTENDERS["rk4"]._replace(divides=False)
-    with pytest.raises(
-        ValueError, match=r"`methods` must have contenders of new names.*'rk4'"
-    ):
+    with pytest.raises(ValueError, match=argument("methods")):
         ji.stability_map([mine])
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from montecarlo_cases import BALLS, BEFORE, CHUNK, GAPS, LAW, sampled, sometimes_bad
+from refusals import argument
 from scipy import stats
 
 import jimpact as ji
@@ -73,9 +74,7 @@ def test_each_sample_is_the_impact_of_its_gaps():
     assert not np.array_equal(
         np.asarray(last), gaps[299 - 256]
     )  # another chunk, other draws
-    with pytest.raises(
-        ValueError, match=r"`index` must lie in \[0, 299\], but has value 300"
-    ):
+    with pytest.raises(ValueError, match=argument("index", "300")):
         result.replay(300)
 
 
@@ -122,9 +121,7 @@ def test_given_samples_are_used_row_by_row():
     wanted = np.where((gaps[:, 0] < gaps[:, 1])[:, None], LEFT, RIGHT)
     np.testing.assert_allclose(result.mean, wanted.mean(axis=0), atol=1e-14)
     np.testing.assert_array_equal(np.asarray(result.replay(299)[1].gaps), gaps[299])
-    with pytest.raises(
-        ValueError, match="`samples` must be at most 300, the rows of `gaps`"
-    ):
+    with pytest.raises(ValueError, match=argument("samples", "301")):
         monte_carlo(LAW, BALLS, BEFORE, gaps, samples=301)
     rows = np.array(
         [[1.0, 0.0, -1.0], [0.5, 0.0, -1.0]]
@@ -233,9 +230,9 @@ def test_bad_arguments_are_named(change, error, message):
 
 
 def test_bad_distributions_are_named():
-    with pytest.raises(ValueError, match="`high` must be at least `low`"):
+    with pytest.raises(ValueError, match=argument("high")):
         Uniform(1.0, 0.0)
-    with pytest.raises(ValueError, match="`std` must lie in"):
+    with pytest.raises(ValueError, match=argument("std", "0")):
         Normal(0.0, 0.0)
     with pytest.raises(
         ValueError, match="that can be random are restitution, but not `friction`"
@@ -243,10 +240,10 @@ def test_bad_distributions_are_named():
         RandomLaw(LAW, friction=Uniform(0.0, 1.0))
     with pytest.raises(
         ValueError,
-        match=r"`restitution` must lie in \[0, 1\], but Uniform.* can leave it",
+        match=argument("restitution"),
     ):
         RandomLaw(LAW, restitution=Uniform(0.5, 1.5))
-    with pytest.raises(ValueError, match="can leave it"):
+    with pytest.raises(ValueError, match=argument("restitution")):
         RandomLaw(LAW, restitution=Normal(0.5, 0.01))
     assert (
         RandomLaw(Compliant(Hertz(1.0)), stiffness=Uniform(1.0, 2.0))(
@@ -317,23 +314,21 @@ def whole():
 
 
 def test_a_quantile_is_a_number(whole):
-    with pytest.raises(TypeError, match="`q` must be numeric, but has value None"):
+    with pytest.raises(TypeError, match=argument("q", "None")):
         whole.quantile(None)
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
     sampled(folder=tmp_path)
-    with pytest.raises(
-        ValueError, match="holds another run, which differs in gaps, key:"
-    ):
+    with pytest.raises(ValueError, match="gaps, key:"):
         sampled(folder=tmp_path, gaps=Uniform(0.0, 2e-5), key=1)
-    with pytest.raises(ValueError, match="differs in law:"):
+    with pytest.raises(ValueError, match="law:"):
         sampled(folder=tmp_path, law=Binary(0.9, order="earliest"))
     (tmp_path / "manifest.json").write_text("{")
-    with pytest.raises(ValueError, match=r"manifest.json' is damaged"):
+    with pytest.raises(ValueError, match=r"manifest\.json'"):
         sampled(folder=tmp_path)
     (tmp_path / "manifest.json").unlink()
-    with pytest.raises(ValueError, match=r"has chunks but no manifest\.json"):
+    with pytest.raises(ValueError, match=r"no manifest\.json"):
         sampled(folder=tmp_path)
 
 
@@ -398,13 +393,9 @@ def test_an_impact_to_a_given_tolerance():
     assert float(out.accuracy) == 1e-3
     own = impact(coarse, BALLS, before, rtol=1e-8).velocity  # the law's own holds
     np.testing.assert_allclose(own, wanted, rtol=1e-14)
-    with pytest.raises(
-        ValueError, match=r"`rtol` must lie in \(0, 1\], but has value 0"
-    ):
+    with pytest.raises(ValueError, match=argument("rtol", "0")):
         impact(LOSSY, BALLS, before, rtol=0.0)
-    with pytest.raises(
-        ValueError, match=r"`rtol` must be at least 3\.6e-15 in float64"
-    ):
+    with pytest.raises(ValueError, match=argument("rtol", "1e-20")):
         impact(LOSSY, BALLS, before, rtol=1e-20)
     traced = jax.jit(
         jax.vmap(lambda rtol: impact(LOSSY, BALLS, before, rtol=rtol).status)

@@ -7,6 +7,7 @@ import numpy as np
 import piles
 import pytest
 from programs import CODE
+from refusals import argument
 from scipy.integrate import solve_ivp
 
 import jimpact as ji
@@ -120,7 +121,7 @@ def test_leaving_the_range_of_a_gap_function_is_reported(options):
     assert (
         5 <= np.isfinite(np.asarray(motion.q[:, 0])).sum() <= 7
     )  # x = 1 at the sixth sample
-    with pytest.raises(ValueError, match="in the range of the gap function"):
+    with pytest.raises(ValueError, match=argument("q0", "-0.5")):
         ji.simulate(system, ji.Moreau(0.5), [1.5, 0.1], [1.0, 0.0], 2.0, **options)
 
 
@@ -302,7 +303,7 @@ def test_tangents_that_do_not_fit_are_named():
     system = ji.System(
         lambda q: q[:1], [1.0, 1.0], tangent_function=lambda q: q[jnp.array([1] * 3)]
     )
-    with pytest.raises(ValueError, match="one tangent a contact"):
+    with pytest.raises(ValueError, match=argument("system")):
         stepped(system, ji.Moreau(0.5, friction=0.2), [1.0, 0.0], [0.0, 0.0])
 
 
@@ -368,7 +369,7 @@ def test_functions_of_a_system_compute_in_the_precision_of_the_start(given, opti
 
 def test_a_disc_without_walls_is_refused():
     disc = piles.discs(1.0, [0.1])
-    with pytest.raises(ValueError, match="each of m >= 1 contacts"):
+    with pytest.raises(ValueError, match=argument("system")):
         stepped(ji.System(disc), ji.Moreau(0.5), disc.at([[0.0, 1.0]]), np.zeros(3))
 
 
@@ -445,7 +446,7 @@ def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, ex
 
 
 def test_steps_too_many_to_count_are_refused():
-    with pytest.raises(ValueError, match="`step` must give at most"):
+    with pytest.raises(ValueError, match=argument("step", "1e-300")):
         ji.simulate(
             ji.System(ji.Column([1.0]), gravity=True),
             ji.Moreau(0.5),

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import piles
 import pytest
+from refusals import argument
 
 import jimpact as ji
 
@@ -140,9 +141,9 @@ def test_spheres_are_a_body_like_others():
 
 
 def test_walls_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match=r"`planes` must have shape \(4,\)"):
+    with pytest.raises(ValueError, match=argument("planes")):
         piles.spheres(1.0, [0.1], planes=[[0.0, 1.0, 0.0]])
-    with pytest.raises(ValueError, match=r"`positions` must have shape \(1, 3\)"):
+    with pytest.raises(ValueError, match=argument("positions")):
         piles.spheres(1.0, [0.1]).at([[0.0, 1.0]])
 
 
@@ -267,11 +268,9 @@ def test_a_mixed_pile_finds_its_contacts_by_the_grid():
 
 
 def test_bad_mixed_piles_are_named():
-    with pytest.raises(
-        TypeError, match=r"`bodies` must be discs, polygons or spheres, not Dimer"
-    ):
+    with pytest.raises(TypeError, match=argument("bodies")):
         ji.Bodies([ji.Dimer(0.1, 0.5)], room=9)
-    with pytest.raises(ValueError, match="`bodies` must hold one or more"):
+    with pytest.raises(ValueError, match=argument("bodies")):
         ji.Bodies([], room=9)
     with pytest.raises(ValueError, match=r"`planes`"):
         ji.Bodies([ji.Disc(0.1)], [[0.0, 0.0, 1.0]], room=9)
@@ -404,26 +403,24 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
     np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
     column = ji.System(ji.Column([1.0]), gravity=True)
-    with pytest.raises(
-        ValueError, match=r"must be of a body with many contacts .* of Column"
-    ):
+    with pytest.raises(ValueError, match=argument("system")):
         steps.contacts(column, ji.Moreau(0.5), [0.0], [-1.0])
-    with pytest.raises(ValueError, match="must lead to a contact within the step"):
+    with pytest.raises(ValueError, match=argument("q")):
         steps.contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v)
 
 
 def test_bad_packings_are_named(struck):
     spheres, q, _ = struck
     row = piles.spheres(1.0, [0.1] * 3, room=1)
-    with pytest.raises(ValueError, match="at most 1 contacts"):
+    with pytest.raises(ValueError, match=argument("q")):
         row.closed_scene(row.at([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]]))
     with pytest.warns(UserWarning, match=r"`q` holds bodies that overlap by 0\.05 m"):
         row.closed_scene(row.at([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.4, 0.0, 0.0]]))
-    with pytest.raises(ValueError, match="`q` must hold bodies that touch"):
+    with pytest.raises(ValueError, match=argument("q")):
         spheres.closed_scene(10 * q)
     with pytest.raises(ValueError, match="below"):
         spheres.closed_scene(q, below=-1.0)
-    with pytest.raises(ValueError, match="`q` must have shape"):
+    with pytest.raises(ValueError, match=argument("q")):
         spheres.closed_scene(q[1:])
 
 
@@ -445,7 +442,5 @@ def test_piles_by_events_are_refused_with_friction():
     at = pile.at([[0.0, 0.0], [0.3, 0.0]])
     law = ji.Compliant(ji.Hertz(1e6), friction=0.1)
     for method in ("events", "contact_forces"):
-        with pytest.raises(
-            ValueError, match="`friction` must be 0 for the contacts of Bodies"
-        ):
+        with pytest.raises(ValueError, match=argument("friction")):
             ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import argument
 
 import jimpact as ji
 
@@ -121,11 +122,9 @@ def test_what_every_law_gets_for_nothing():
     slope = jax.jit(jax.grad(lambda law: ji.impact(law, BALLS, V).velocity[0]))(law)
     assert type(slope) is Blended
     assert float(slope.share) != 0
-    with pytest.raises(
-        ValueError, match=r"`share` must lie in \[0, 0\.5\], but has value 0\.7"
-    ):
+    with pytest.raises(ValueError, match=argument("share", "0.7")):
         Blended(0.8, 0.7)
-    with pytest.raises(ValueError, match=r"`share` must have shape \(2,\)"):
+    with pytest.raises(ValueError, match=argument("share")):
         ji.impact(Blended(0.8, [0.1, 0.2, 0.3]), BALLS, V)
 
 
@@ -231,7 +230,7 @@ def test_it_is_sampled():
     found = ji.monte_carlo(law, BALLS, [1.0, 0.0, -0.5], samples=64, chunk=64)
     assert found.count > 0
     assert found.std.min() > 0
-    with pytest.raises(ValueError, match=r"`share` must lie in \[0, 0\.5\]"):
+    with pytest.raises(ValueError, match=argument("share")):
         ji.RandomLaw(Blended(0.8, 0.25), share=ji.Uniform(0.1, 0.6))
 
 
@@ -304,9 +303,7 @@ def test_advise_tries_it():
         )
         assert advice.name == "half"
         assert [*advice.candidates][:2] == ["half", "newton"]
-        with pytest.raises(
-            ValueError, match="`simplicity` must be None for a law that needs `share`"
-        ):
+        with pytest.raises(ValueError, match=argument("simplicity")):
             ji.register("blended", Blended, simplicity=2)
     finally:
         del ji.REGISTRY["half"]

@@ -14,6 +14,7 @@ from canned import canned, impact_history, rocked
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from pictures_cases import BALLS, STRIKE, force_chains, samples
+from refusals import argument
 
 import jimpact as ji
 from jimpact.core.audits import Audit
@@ -400,11 +401,9 @@ def test_the_law_closest_to_the_measured_velocities_is_named():
 
 def test_a_history_must_be_one():
     batch = jax.tree.map(lambda x: np.stack([x, x]), impact_history())
-    with pytest.raises(
-        ValueError, match="`result` must be of one impact, but is a batch"
-    ):
+    with pytest.raises(ValueError, match=argument("result")):
         ji.plot.history(batch)
-    with pytest.raises(TypeError, match="`drawn` must be a chain"):
+    with pytest.raises(TypeError, match=argument("drawn")):
         ji.plot.system(ji.Scene([1.0], [[1.0]]), [1.0])
 
 
@@ -433,9 +432,9 @@ def test_regions_of_a_corner_plot_hold_what_they_say():
         assert max(axes.lines[0].get_ydata()) == pytest.approx(
             1 / (error * np.sqrt(2 * np.pi))
         )
-    with pytest.raises(ValueError, match=r"`draws` must have shape \(N, 3\)"):
+    with pytest.raises(ValueError, match=argument("draws")):
         ji.plot.corner(fit, np.ones((5, 2)))
-    with pytest.raises(ValueError, match="`fit` must have a standard error"):
+    with pytest.raises(ValueError, match=argument("fit")):
         ji.plot.corner(fit, names=["stiffness[2]"])
-    with pytest.raises(ValueError, match="`names` must be one of"):
+    with pytest.raises(ValueError, match=argument("names", "'friction'")):
         ji.plot.corner(fit, names=["friction"])

@@ -14,6 +14,7 @@ from canned import canned, rocked
 from matplotlib.animation import FFMpegWriter
 from PIL import Image
 from programs import CODE
+from refusals import argument
 
 import jimpact as ji
 from jimpact.fits.findings import Finding
@@ -212,7 +213,7 @@ def test_confidence_intervals_are_cut_at_the_bounds():
     edge = canned(4, value=np.array([0.995, 2.0])).confidence_interval()
     assert edge[0, 1] == 1.0
     assert 0.9 < edge[0, 0] < 0.99
-    with pytest.raises(ValueError, match=r"`level` must lie in \(0, 1\)"):
+    with pytest.raises(ValueError, match=argument("level", "95")):
         canned(4).confidence_interval(95)
 
 
@@ -281,9 +282,7 @@ def test_a_motion_goes_on():
     )
     np.testing.assert_allclose(both.event_times(), [0.25, 0.65])
     assert (int(both.events.count), int(both.steps)) == (2, 18)
-    with pytest.raises(
-        ValueError, match=r"`later` must begin at 0\.4 s, .* begins at 0 s"
-    ):
+    with pytest.raises(ValueError, match=argument("later")):
         ended.then(found)
     with pytest.raises(ValueError, match="pick one motion"):
         jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found).then(later)
@@ -378,13 +377,9 @@ def test_pictures_of_many_bodies_show_those_that_move_most():
         8.0
     )  # the largest coordinate
     assert np.ptp(flat["coordinates [rad]"].get_ylim()) == pytest.approx(1.0)
-    with pytest.raises(
-        ValueError, match=r"`bodies` must hold some of \[0, 1, .*\], but holds 8"
-    ):
+    with pytest.raises(ValueError, match=argument("bodies", "8")):
         ji.plot.motion(found, system=system, bodies=[8])
-    with pytest.raises(
-        ValueError, match=r"`contacts` must hold numbers in \[0, 7\], but holds 8"
-    ):
+    with pytest.raises(ValueError, match=argument("contacts", "8")):
         ji.plot.motion(found, system=system, contacts=[8])
 
 
@@ -404,9 +399,7 @@ def test_films_run_in_time(tmp_path):
         system, found, tmp_path / "a.html", "Dimer", speed=0.5
     ).read_text()
     assert len(re.findall(r"frames\[\d+\] = ", page)) == 26
-    with pytest.raises(
-        ValueError, match=r"must end in \.gif or \.mp4 or \.html, but is 'a\.avi'"
-    ):
+    with pytest.raises(ValueError, match=argument("path", "'a.avi'")):
         ji.plot.animation(system, found, "a.avi")
     with pytest.raises(ValueError, match="`speed`"):
         ji.plot.animation(system, found, tmp_path / "a.gif", speed=0.0)
@@ -415,7 +408,7 @@ def test_films_run_in_time(tmp_path):
 def test_films_in_mp4_need_ffmpeg(tmp_path, monkeypatch):
     monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
     system, found = rocked()
-    with pytest.raises(RuntimeError, match="ffmpeg must be installed"):
+    with pytest.raises(RuntimeError, match=argument("path")):
         ji.plot.animation(system, found, tmp_path / "dimer.mp4")
 
 
@@ -443,9 +436,7 @@ def test_phase_portrait_of_what_moves():
     assert [text.get_text() for text in legend.get_texts()] == ["jump at an event"]
     unnamed = ji.plot.phase_portrait(found).axes[0].get_xlabel()
     assert unnamed == "q3  (`system=` or `names=` name it)"
-    with pytest.raises(
-        ValueError, match=r"`coordinate` must lie in \[0, 2\], but is 3"
-    ):
+    with pytest.raises(ValueError, match=argument("coordinate", "3")):
         ji.plot.phase_portrait(found, 3)
 
 

@@ -2,18 +2,19 @@
 
 import numpy as np
 import pytest
+from refusals import argument
 
 import jimpact as ji
 
 
 def test_register_refuses():
-    with pytest.raises(ValueError, match="`name` must be new, but 'newton' is Newton"):
+    with pytest.raises(ValueError, match=argument("name")):
         ji.register("newton", ji.Moreau)
-    with pytest.raises(TypeError, match="`law` must be a class of Law"):
+    with pytest.raises(TypeError, match=argument("law")):
         ji.register("nothing", int)
-    with pytest.raises(ValueError, match="`promises` must be one of"):
+    with pytest.raises(ValueError, match=argument("promises", "'beauty'")):
         ji.register("mine", ji.Newton, promises={"beauty"})
-    with pytest.raises(ValueError, match="small letters"):
+    with pytest.raises(ValueError, match=argument("name", "'Mine'")):
         ji.register("Mine", ji.Newton)
 
 

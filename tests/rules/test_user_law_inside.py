@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from command_line import main
+from refusals import argument
 
 import jimpact as ji
 from jimpact import read_study
@@ -91,17 +92,15 @@ def law(folder):
 
 def test_declared_domains(law):
     kind = type(law)
-    with pytest.raises(
-        ValueError, match=r"`loss` must lie in \[0, 0.5\], but has value 0.6"
-    ):
+    with pytest.raises(ValueError, match=argument("loss", "0.6")):
         kind(0.8, 0.6)
-    with pytest.raises(ValueError, match=r"`hardness` must lie in \(0, inf\)"):
+    with pytest.raises(ValueError, match=argument("hardness", "0")):
         kind(0.8, hardness=0.0)
-    with pytest.raises(ValueError, match="`kind` must be one of"):
+    with pytest.raises(ValueError, match=argument("kind", "'third'")):
         kind(0.8, kind="third")
-    with pytest.raises(TypeError, match="`restitution` must be numeric"):
+    with pytest.raises(TypeError, match=argument("restitution", "'high'")):
         kind("high")
-    with pytest.raises(ValueError, match="`restitution` must have shape"):
+    with pytest.raises(ValueError, match=argument("restitution")):
         ji.impact(kind([0.8, 0.7, 0.6]), PAIR, V)
     assert ji.REGISTRY["sluggish"].parameters == ("restitution", "loss", "hardness")
     assert ji.REGISTRY["sluggish"].required == ("restitution",)
@@ -121,7 +120,7 @@ def test_study_fit_and_monte_carlo(folder):
     assert hard.bounds[0][1] == 2e-4  # fitted in its logarithm
     sampled = ji.monte_carlo(**study.monte_carlo)
     assert sampled.statuses == {"ok": 100}
-    with pytest.raises(ValueError, match=r"`loss` must lie in \[0, 0.5\]"):
+    with pytest.raises(ValueError, match=argument("loss")):
         ji.RandomLaw(study.law, loss=ji.Uniform(0.0, 0.6))
 
 

@@ -4,6 +4,7 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
+from refusals import argument
 
 import jimpact as ji
 
@@ -53,9 +54,7 @@ def test_turning_keeps_its_unit(tmp_path):
     data = ji.read_experiments(written(tmp_path, head + "1,180,1,2\n"))
     assert data.units == ("m/s", "rad/s")
     np.testing.assert_allclose(data.pre, [[1.0, np.pi]])
-    with pytest.raises(
-        ValueError, match=r"all columns of velocity 2 must be in m/s or all in rad"
-    ):
+    with pytest.raises(ValueError, match=r"line 1: .*\b2\b"):
         ji.read_experiments(
             written(tmp_path, head.replace("rad/s", "m/s") + "1,180,1,2\n")
         )
@@ -63,9 +62,7 @@ def test_turning_keeps_its_unit(tmp_path):
 
 def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
-    with pytest.warns(
-        UserWarning, match=r"line 4, column `post_2 \[m/s\]`: the cell is NaN"
-    ):
+    with pytest.warns(UserWarning, match=r"line 4, column `post_2 \[m/s\]`: "):
         data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal(data.pre, [[2, 0], [2, 0]])
     np.testing.assert_array_equal(data.post, [[1, np.nan], [1, np.nan]])
@@ -79,7 +76,7 @@ def test_comments_are_not_read(tmp_path):
     )
     data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal([data.pre, data.post], [[[1], [2]], [[0.5], [1]]])
-    with pytest.raises(ValueError, match="must have 4 values"):
+    with pytest.raises(ValueError, match="line 4: "):
         ji.read_experiments(written(tmp_path, text + "a,1,2\n"))
 
 
@@ -115,7 +112,7 @@ def test_data_sets_are_joined():
     ):
         with pytest.raises(ValueError, match=f"`many` must have .*{message}"):
             plain + other
-    with pytest.raises(ValueError, match="at least one data set"):
+    with pytest.raises(ValueError, match=argument("many")):
         ji.Experiments.join([])
 
 
@@ -160,9 +157,9 @@ def test_bad_files(tmp_path, text, message):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"'nowhere\.csv' does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"'nowhere\.csv'"):
         ji.read_experiments("nowhere.csv")
-    with pytest.raises(ValueError, match="must be UTF-8 text"):
+    with pytest.raises(ValueError, match="UTF-8"):
         ji.read_experiments(written(tmp_path, HEAD, encoding="utf-16"))
 
 
@@ -214,9 +211,7 @@ def test_a_wall_takes_all_momentum_and_two_pairs_conserve_two():
 
 def test_a_scene_is_needed():
     data = ji.Experiments([1.0, 0.0], [0.0, 1.0])
-    with pytest.raises(
-        ValueError, match="`scene` must be a Scene where the experiments carry none"
-    ):
+    with pytest.raises(ValueError, match=argument("scene")):
         data.momentum_excess()
     own = ji.Experiments([1.0, 0.0], [0.0, 1.1], scenes=[ji.chain([1.0, 1.0])])
     np.testing.assert_allclose(own.momentum_excess(), [[0.1]], atol=1e-15)
@@ -232,7 +227,7 @@ def test_masses_and_gaps_of_each_shot(tmp_path):
     np.testing.assert_allclose([s.gaps for s in data.scenes], [[0.0], [0.002]])
     assert data.contacts.tolist() == [1, 1]
     assert data.only([1]).shots == ("2",)
-    with pytest.raises(ValueError, match=r"columns `mass` must belong to a chain"):
+    with pytest.raises(ValueError, match="columns `mass`"):
         ji.read_experiments(path)
 
 
@@ -259,9 +254,7 @@ def test_a_body_where_each_shot_found_it(tmp_path):
     data = ji.read_experiments(path, ji.Block(width=1.0, height=2.0), near=1e-3)
     assert data.contacts.tolist() == [2, 1]  # its base, its corner
     assert data.units == ("m/s", "m/s", "rad/s")
-    with pytest.raises(
-        ValueError, match=r"columns `q` must belong to a body, but are given for"
-    ):
+    with pytest.raises(ValueError, match="columns `q`"):
         ji.read_experiments(path, CHAIN)
 
 

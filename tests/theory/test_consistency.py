@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from consistency_cases import HORN, close
 from programs import kinetic_norm
+from refusals import argument
 
 import jimpact as ji
 from jimpact import kinetic_energy, velocity_change
@@ -42,9 +43,7 @@ def test_largest_size_and_beyond():
     found = copositivity(q)
     close(found.margin, -4.0)
     close(np.flatnonzero(found.witness), [1, 4, 5, 9])
-    with pytest.raises(
-        ValueError, match=r"`matrix` must have at most 12 rows.*but has 13"
-    ):
+    with pytest.raises(ValueError, match=argument("matrix", "13")):
         copositivity(np.eye(13))
 
 

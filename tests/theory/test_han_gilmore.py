@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import argument
 
 import jimpact as ji
 from jimpact import han_gilmore
@@ -287,13 +288,11 @@ def test_friction_of_a_block_on_two_corners():
 
 def test_bad_coefficients():
     balls = ji.chain(jnp.ones(3))
-    with pytest.raises(ValueError, match=r"`restitution` must lie in \[0, 1\]"):
+    with pytest.raises(ValueError, match=argument("restitution", "1.2")):
         han_gilmore(balls, [1.0, 0, 0], 1.2)
-    with pytest.raises(
-        ValueError, match="`restitution` must be a scalar or have shape"
-    ):
+    with pytest.raises(ValueError, match=argument("restitution")):
         han_gilmore(balls, [1.0, 0, 0], [0.5] * 3)
-    with pytest.raises(ValueError, match="`scene` must have one tangent a contact"):
+    with pytest.raises(ValueError, match=argument("scene")):
         han_gilmore(balls, [1.0, 0, 0], 0.5, 0.1)
     with pytest.raises(ValueError, match="`friction`"):
         han_gilmore(ji.Block(1.0, 2.0, corners="base").scene(), [0.0, -1, 0], 0.5, -0.1)

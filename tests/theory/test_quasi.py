@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from programs import kinetic_norm
+from refusals import argument
 
 import jimpact as ji
 from jimpact.theory import (
@@ -204,12 +205,12 @@ def test_basis_does_not_depend_on_rounding():
 
 
 def test_redundant_contacts_are_refused():
-    with pytest.raises(ValueError, match="3 of them for 2 velocities"):
+    with pytest.raises(ValueError, match=argument("scene")):
         quasi_basis(ji.Scene([1.0, 1.0], [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]))
-    with pytest.raises(ValueError, match="redundant ones"):
+    with pytest.raises(ValueError, match=argument("scene")):
         quasi_basis(ji.Scene([1.0, 1.0], [[1.0, 1.0], [0.0, 0.0]]))
     with pytest.raises(
-        ValueError, match="redundant ones"
+        ValueError, match=argument("scene")
     ):  # a contact that a constraint holds
         quasi_basis(
             ji.Scene(
@@ -219,11 +220,11 @@ def test_redundant_contacts_are_refused():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match=r"`velocity` must have shape \(3,\)"):
+    with pytest.raises(ValueError, match=argument("velocity")):
         to_quasi_velocities(block(), [1.0, 2.0])
-    with pytest.raises(ValueError, match=r"`tangential` must have shape \(1,\)"):
+    with pytest.raises(ValueError, match=argument("tangential")):
         from_quasi_velocities(block(), [1.0, 2.0], [1.0, 2.0])
-    with pytest.raises(ValueError, match="must have tangents"):
+    with pytest.raises(ValueError, match=argument("scene")):
         contact_power(ji.chain([1.0, 1.0]), [1.0, 0.0], [1.0], [1.0])
-    with pytest.raises(ValueError, match=r"`force` must have shape \(2,\)"):
+    with pytest.raises(ValueError, match=argument("force")):
         contact_power(block(), [1.0, 0.0, 0.0], [1.0])

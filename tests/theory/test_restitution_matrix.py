@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from programs import CODE, kinetic_norm
+from refusals import argument
 
 import jimpact as ji
 from jimpact import RestitutionMatrix
@@ -344,13 +345,13 @@ def test_bad_matrix(matrix, message):
 def test_matrix_that_does_not_fit_the_scene():
     with pytest.raises(ValueError, match=r"shape \(2, 2\) or \(3, 3\) for 2 contacts"):
         ji.impact(RestitutionMatrix(jnp.eye(4)), CHAIN, [1.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="without tangents"):
+    with pytest.raises(ValueError, match=argument("matrix")):
         ji.impact(RestitutionMatrix(jnp.eye(3)), CHAIN, [1.0, 0.0, 0.0])
     flat = block()
     gapped = ji.Scene(flat.mass, flat.normals, flat.tangents, gaps=[0.0, 1e-3])
-    with pytest.raises(ValueError, match="closed contacts only"):
+    with pytest.raises(ValueError, match=argument("scene")):
         ji.impact(RestitutionMatrix(rocking_matrix(0.5)), gapped, [0.0, -1.0, 0.0])
-    with pytest.raises(ValueError, match="must lie in"):
+    with pytest.raises(ValueError, match=argument("restitution", "1.5")):
         rocking_matrix(1.5)
-    with pytest.raises(ValueError, match="`aspect` must lie in"):
+    with pytest.raises(ValueError, match=argument("aspect", "0")):
         housner_restitution(0.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import argument
 
 import jimpact as ji
 
@@ -130,10 +131,10 @@ def test_places_units_and_times_of_motion_capture(tmp_path, kind):
 
 
 def test_units_that_contradict_the_file_or_are_not_stated(tmp_path):
-    with pytest.raises(ValueError, match="states no unit"):
+    with pytest.raises(ValueError, match="unit"):
         ji.tracks.read(written(tmp_path, qualisys(False)), "ball z")
     for text in (trc(), OPTITRACK.replace("cube", "ball"), VICON):
-        with pytest.raises(ValueError, match="states the unit mm"):
+        with pytest.raises(ValueError, match=r"\bmm\b"):
             ji.tracks.read(written(tmp_path, text), "ball z", unit="m")
     _, q = ji.tracks.read(written(tmp_path, OLDER), ["ball x", "toss:ball y"])
     np.testing.assert_allclose(q, PLACES[:, :2] / 1000)
@@ -145,7 +146,7 @@ def test_poses_of_rigid_bodies(tmp_path):
     np.testing.assert_allclose(q[:, :3], PLACES / 1000)
     np.testing.assert_allclose(q[:, 3:], np.tile([0.0, 0.0, 0.6, 0.8], (3, 1)))
     path = written(tmp_path, OPTITRACK.replace("Quaternion", "XYZ"))
-    with pytest.raises(ValueError, match="no axis `qx`"):
+    with pytest.raises(ValueError, match="`qx`"):
         ji.tracks.read(path, "cube qx")
 
 
@@ -153,9 +154,7 @@ def test_times_of_trc_and_its_rate(tmp_path):
     """Three decimals at 120 Hz are steps of 8 and 9 ms: the times are those of the frames."""
     t, _ = ji.tracks.read(written(tmp_path, trc("120.00", 1 / 120, 3)), "ball z")
     np.testing.assert_allclose(t, np.arange(3) / 120, atol=1e-12)
-    with pytest.raises(
-        ValueError, match=r"240 frames a second, but its times are 0\.0083"
-    ):
+    with pytest.raises(ValueError, match=r"\b240\b.*\b0\.0083"):
         ji.tracks.read(written(tmp_path, trc("240.00", 1 / 120)), "ball z")
 
 
@@ -204,7 +203,7 @@ def test_rows_of_a_long_table_and_frame_numbers(tmp_path):
         ji.tracks.read(path, "x_mm", where={"body": "C"}, **some)
     with pytest.raises(ValueError, match="frame='frame'"):
         ji.tracks.read(path, "x_mm", where={"body": "A"}, rate=50, unit="mm")
-    with pytest.raises(ValueError, match="`frame` needs `rate`"):
+    with pytest.raises(ValueError, match=argument("frame")):
         ji.tracks.read(path, "x_mm", where={"body": "A"}, frame="frame", unit="mm")
     path = written(tmp_path, LONG.replace("4,", "3,"))
     with pytest.warns(UserWarning, match="repeats"):
@@ -218,11 +217,11 @@ def test_tables_without_names_and_steps_for_times(tmp_path):
     t, q = ji.tracks.read(path, [1, 2], rate=100, unit="m")
     np.testing.assert_allclose(q, [row[1:] for row in rows])
     np.testing.assert_allclose(t, np.arange(4) / 100)
-    with pytest.raises(ValueError, match="steps between frames"):
+    with pytest.raises(ValueError, match="column `0`"):
         ji.tracks.read(path, [1], time=0, unit="m")
     with pytest.raises(ValueError, match="counted"):
         ji.tracks.read(path, [7], rate=100, unit="m")
-    with pytest.raises(ValueError, match="all be names, or all numbers"):
+    with pytest.raises(ValueError, match="1, 't'"):
         ji.tracks.read(path, [1], time="t", unit="m")
 
 
@@ -231,7 +230,7 @@ def test_two_takes_in_one_file_and_a_unit_that_a_name_states(tmp_path):
         f"{x};{y}" for x, y in ((0, 1), (1, 2), (0.5, 3), (2, 4))
     )
     path = written(tmp_path, text)
-    with pytest.raises(ValueError, match="two takes"):
+    with pytest.raises(ValueError, match="column `t`"):
         ji.tracks.read(path, "height (cm)", time="t")
     _, q = ji.tracks.read(path, "height (cm)", rate=10)
     np.testing.assert_allclose(q[:, 0], [0.01, 0.02, 0.03, 0.04])

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from commands_cases import call
+from refusals import argument
 from scipy.integrate import solve_ivp
 
 import jimpact as ji
@@ -331,7 +332,7 @@ def test_a_body_that_is_held_in_the_middle_of_a_track_has_no_shots_there():
 def test_a_window_that_leaves_too_few_frames_is_refused():
     t, y, _ = ball(np.random.default_rng(2))
     for window in (1e-6, 0.012):
-        with pytest.raises(ValueError, match="`window` must leave 3 frames or more"):
+        with pytest.raises(ValueError, match=argument("window")):
             ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=window)
 
 
@@ -490,7 +491,7 @@ def test_impacts_of_unknown_gravity_are_all_found():
 def test_a_body_in_space_is_refused_with_advice():
     t, q, _ = ball(np.random.default_rng(1), coordinates=3)
     track = ji.tracks.find_impacts(t, q, 1e-3, acceleration=[0, 0, -G])
-    with pytest.raises(ValueError, match=r"body in space.*`quaternion`"):
+    with pytest.raises(ValueError, match=argument("scene")):
         track.experiments(ji.Box([0.1, 0.1, 0.1]))
 
 
@@ -527,7 +528,7 @@ def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
         ji.tracks.read(path, "Run 1: Height (mm)", time=time, unit="mm")[1],
         [[1.5], [np.nan], [1.7]],
     )
-    with pytest.raises(ValueError, match="states the unit mm"):
+    with pytest.raises(ValueError, match=r"\bmm\b"):
         ji.tracks.read(path, "Run 1: Height (mm)", time=time, unit="m")
     path.write_text(CAPTURE)
     t, q = ji.tracks.read(path, ["X", "Y"], rate=100, unit="mm")

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from refusals import argument
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -153,7 +154,7 @@ def test_a_brick_turns_freely_between_impacts():
         assert any(
             "turn freely" in x or "residuals of" in x for x in as_sphere.warnings
         )
-    with pytest.raises(ValueError, match=r"moments of inertia.*inertia=body\.inertia"):
+    with pytest.raises(ValueError, match=argument("scene")):
         as_sphere.experiments(BRICK)
 
 
@@ -174,11 +175,11 @@ def test_both_orders_of_quaternions_and_both_signs():
     fit = ji.fit(law, None, shots, free=("restitution", "friction"), starts=1)
     assert fit.warnings == ()
     assert (np.abs(fit.value - [0.6, 0.2]) < 4 * fit.standard_error).all()
-    held = ji.fit(law, None, shots, starts=1).warnings[0]
-    assert "Lack of fit" in held
-    assert "`friction` is held at its start" in held
+    held = ji.fit(law, None, shots, starts=1)
+    assert held.found("lack_of_fit")
+    assert "`friction` is held" in held.warnings[0]
     for wrong, order in ((q, "xyzw"), (q[:, TO_XYZW], "wxyz")):
-        with pytest.raises(ValueError, match=r"order of the file.* in the other one 1"):
+        with pytest.raises(ValueError, match=argument("quaternion")):
             found(t, wrong, order=order).experiments(CUBE)
 
 
