@@ -482,14 +482,16 @@ def test_remark_6_11():
 
 def test_rocking_matrix():
     """Housner's block: the base turns from one corner to the other, the sliding rate keeps its sign."""
-    E, printed = (
-        np.array([[0, s, 0], [s, 0, 0], [0, 0, -s]]) * 0.8 for s in (1.0, -1.0)
-    )
-    before = np.array([-1.0, 0.0, 0.5])  # corner 1 comes down about corner 2
-    after = -E @ before
-    assert after[1] > 0  # corner 2 lifts off
-    assert (-printed @ before)[1] < 0
-    assert (E[:2, :2] >= 0).all()  # Prop. 6.2 (i)
+    right = 0.8 * np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    printed = -right  # in the book
+    before = np.array(
+        [-1.0, 0.0, 0.5]
+    )  # corner 1 comes down about corner 2; both slide
+    _, corner_2, _ = -right @ before
+    assert corner_2 > 0  # it lifts off
+    _, corner_2, _ = -printed @ before
+    assert corner_2 < 0  # it would go into the ground
+    assert (right[:2, :2] >= 0).all()  # Prop. 6.2 (i)
 
 
 def hertz(young, nu, radius):

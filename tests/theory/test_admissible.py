@@ -262,6 +262,7 @@ def test_contains_agrees_with_the_definition():
 
 
 def test_contains_wants_the_momentum_balance():
+    """Three equal balls with V = (1, 0, 0): velocities after an impact sum to 1."""
     assert THREE.contains([0.0, 0.25, 0.75])
     assert not THREE.contains([0.0, 0.25, 0.7])
     assert not THREE.contains(V)
