@@ -265,8 +265,9 @@ class Bodies(RigidBodies):
         return jnp.concatenate([self.of_bodies(q), places])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps (m,), points and normals (m, ..) at q, and the bodies of each
-        contact.
+        """Gaps (m,), points and normals (m, ..) at q, in the order of
+        `pairs_in_contact`: with planes, of two round bodies, of a round one and one
+        with faces, and two of each pair with faces.
         """
         placed = self.placed(q)
         rims = self.rims

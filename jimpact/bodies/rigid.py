@@ -707,8 +707,8 @@ class RigidBody(RigidBodies):
         return super().at(place[None], None if turn is None else [turn])
 
     def touching(self, turn: Any = None) -> jax.Array:
-        """q at which the lowest contacts touch, turned by an angle [rad] or a
-        quaternion (4,).
+        """q at which the lowest contacts touch, turned by an angle [rad] or, in space,
+        a quaternion (4,); None: not turned.
         """
         if self.dimension == 2:
             return _lowered(self, number("angle", 0.0 if turn is None else turn)[None])

@@ -6,6 +6,7 @@ state before the step that contains it; the sample is one more step from there.
 """
 
 import dataclasses
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jimpact.events import implicit_steps
-from jimpact.events.contact_flow import ContactStates
+from jimpact.events.contact_flow import ContactFlow, ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
 from jimpact.events.implicit_steps import ImplicitState, ImplicitSteps
-from jimpact.events.run import run
+from jimpact.events.run import ImpactEnd, run
 from jimpact.events.wedged_limit import inspect
 from jimpact.numerics import stepper
 from jimpact.tools.masks import quotient
@@ -109,26 +110,6 @@ class HistoryProgram:
             flow, gamma, modes, y, max_passes, inspect, checkpoints, observe, seen
         )
         last = flow.contact_states(end.carry.step.modes, end.reached).force
-        no_target = jnp.zeros(end.carry.step.target.shape, bool)
-
-        def sampled(
-            sample: Any,
-        ) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
-            """Time, twice the energy and contact states of a sample, by one more
-            step.
-            """
-            fraction, state, modes, clock = sample
-            # of time in the flow's own time
-            rate = flow.contact_states(modes, state).rate
-            since = fraction * time_of(end.reached) - time_of(state)
-            ahead = quotient(since, rate, where=rate > 0)
-            step = stepper.Step(modes, no_target, clock)
-            state = stepper.between(flow, step, state, ahead)
-            contacts = flow.contact_states(modes, state)
-            x = jnp.maximum(contacts.indentation, 0.0)
-            energy = flow.energy(x, jnp.zeros_like(x))
-            return time_of(state), energy, contacts._replace(indentation=x)
-
         over = t >= time_of(end.reached)[None]
         samples = (
             self.fractions(y.dtype),
@@ -136,10 +117,32 @@ class HistoryProgram:
             jnp.where(over, end.carry.step.modes[None], end.seen.modes),
             jnp.where(over, 0.0, end.seen.clock),
         )
-        time, energy, contacts = jax.lax.map(sampled, samples)
+        time, energy, contacts = jax.lax.map(partial(_sampled, flow, end), samples)
         is_last = last > end.seen.force
         force = jnp.where(is_last, last, end.seen.force)
         return time, energy, *contacts, force, end.status.astype(y.dtype)
+
+
+def _sampled(
+    flow: ContactFlow, end: ImpactEnd, sample: Any
+) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
+    """Time, twice the energy and contact states of a sample, by one more step.
+
+    `sample`: its time over the duration, then state, modes and clock of the step that
+    it lies in.
+    """
+    fraction, state, modes, clock = sample
+    # of time in the flow's own time
+    rate = flow.contact_states(modes, state).rate
+    since = fraction * time_of(end.reached) - time_of(state)
+    ahead = quotient(since, rate, where=rate > 0)
+    no_target = jnp.zeros(end.carry.step.target.shape, bool)
+    step = stepper.Step(modes, no_target, clock)
+    state = stepper.between(flow, step, state, ahead)
+    contacts = flow.contact_states(modes, state)
+    x = jnp.maximum(contacts.indentation, 0.0)
+    energy = flow.energy(x, jnp.zeros_like(x))
+    return time_of(state), energy, contacts._replace(indentation=x)
 
 
 @dataclasses.dataclass(frozen=True)

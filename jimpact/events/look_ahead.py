@@ -62,6 +62,21 @@ class _Look(NamedTuple):
     clear: Bool[Array, "1 B"]  # dp_j - p_j was far enough from 0 in all states
 
 
+def _steps_of(flow: Any, x: Float[Array, "m B"]) -> ImplicitSteps:
+    """The impacts of a flow with indentations x by implicit steps, without friction."""
+    return ImplicitSteps(
+        coupling=flow.coupling,
+        equations=flow.equations,
+        omega=flow.omega,
+        restitution=flow.restitution,
+        exponent_array=flow.exponent_array,
+        friction=jnp.zeros_like(x),
+        descent=descent_of(flow.coupling, flow.contacts),
+        tolerance=flow.tolerance,
+        exponent_static=flow.exponent_static,
+    )
+
+
 def comes_to_rest(
     flow: Any,
     modes: Int[Array, "modes B"],
@@ -80,17 +95,7 @@ def comes_to_rest(
     x, g, _ = flow.rows(y)
     # error that the law's tolerance allows in the outcome, see `dimensionless`
     visible = flow.tolerance * jnp.maximum(flow.taking_part, 2) / 2
-    steps = ImplicitSteps(
-        coupling=flow.coupling,
-        equations=flow.equations,
-        omega=flow.omega,
-        restitution=flow.restitution,
-        exponent_array=flow.exponent_array,
-        friction=jnp.zeros_like(x),
-        descent=descent_of(flow.coupling, m),
-        tolerance=flow.tolerance,
-        exponent_static=flow.exponent_static,
-    )
+    steps = _steps_of(flow, x)
 
     def holds(s: ImplicitState) -> Float[Array, "m B"]:
         """Approach, or root of the stored energy if that is more, of each contact."""

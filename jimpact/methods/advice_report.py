@@ -253,7 +253,11 @@ def share(x: float) -> str:
 
 
 def as_code(law: Declared) -> str:
-    """Python expression of a law: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
+    """Python expression of a law: `LZB(0.9, 1, 1.5, rtol=0.001)`.
+
+    Laws within it are written alike; options that are None, or words at their default,
+    are left out.
+    """
     words = []
     for each in fields(law):
         value = getattr(law, each.name)
@@ -315,8 +319,11 @@ def _block_lines(advice: Advice) -> list[str]:
 
 
 def _cause(advice: Advice) -> str:
-    """Phrase: the cause of the advice (no approach, contacts that act alone, gaps,
-    stiffnesses).
+    """Phrase: the cause of the advice, the first of these that holds.
+
+    Nothing approaches; contacts act alone; no law is within the tolerance, so that a
+    stiffness must be measured; gaps; contacts that close again; contacts of e = 0; else
+    the stiffnesses.
     """
     at_work = [block for block in advice.blocks if block.approaches]
     if not at_work:

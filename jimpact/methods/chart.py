@@ -469,6 +469,33 @@ def _outcomes_over_ladder(
         advance(len(ladders[name]))
 
 
+def _jacobian(
+    names: tuple[str, ...],
+    run: Callable[..., Outcomes],
+    k: jax.Array,
+    case: Case,
+    setting: jax.Array,
+) -> Any:
+    """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3
+    m).
+    """
+
+    def velocity(at: dict[str, jax.Array]) -> jax.Array:
+        """v+ (n,) [m/s] at the parameters `at` (m,) by name; 'ln k' is a change of
+        ln k.
+        """
+        law = case.law
+        for name in names:
+            law = with_entries(law, (name,), at[name])
+        factor = jnp.exp(at["ln k"])
+        return run(k * factor, case._replace(law=law), setting).velocity
+
+    at = {"ln k": jnp.zeros_like(k)}
+    at |= {name: getattr(case.law, name) for name in names}
+    parts = jax.jacfwd(velocity)(at)
+    return jnp.concatenate([parts[name] for name in at], axis=-1)
+
+
 def _method_programs(
     contender: Contender, case: Case, gradients: bool, durations: bool
 ) -> Programs:
@@ -494,26 +521,6 @@ def _method_programs(
             return solution._replace(duration=jnp.nan)
         return solution
 
-    def jacobian(k: jax.Array, case: Case, setting: jax.Array) -> Any:
-        """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3
-        m).
-        """
-
-        def velocity(at: dict[str, jax.Array]) -> jax.Array:
-            """v+ (n,) [m/s] at the parameters `at` (m,) by name; 'ln k' is a change of
-            ln k.
-            """
-            law = case.law
-            for name in names:
-                law = with_entries(law, (name,), at[name])
-            factor = jnp.exp(at["ln k"])
-            return timed(k * factor, case._replace(law=law), setting).velocity
-
-        at = {"ln k": jnp.zeros_like(k)}
-        at |= {name: getattr(case.law, name) for name in names}
-        parts = jax.jacfwd(velocity)(at)
-        return jnp.concatenate([parts[name] for name in at], axis=-1)
-
     k = case.stiffness
     compile_time = dict[str, float]()
 
@@ -526,6 +533,10 @@ def _method_programs(
         each = jax.vmap(function, in_axes=(0, None, None))
         return _compiled(compile_time, name, each, k[:rows], case)
 
+    gradient = None
+    if gradients:
+        jacobian = partial(_jacobian, names, timed)
+        gradient = batch("gradient", jacobian, case.sample)
     batched = batch("batched", timed, len(k))
     # errors need the duration, times do not: two programs if it takes a run of its own
     if durations and apart:
@@ -539,7 +550,7 @@ def _method_programs(
         sampled=lambda setting: jax.tree.map(
             lambda a: a[: case.sample], complete(setting)
         ),
-        gradient=batch("gradient", jacobian, case.sample) if gradients else None,
+        gradient=gradient,
         compile_time=compile_time,
     )
 

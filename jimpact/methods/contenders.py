@@ -72,7 +72,7 @@ class Contender(NamedTuple):
 
     def supports(self, law: LZB) -> str | None:
         """None, or the reason why it cannot integrate this law, to follow the word
-        "it".
+        "it": friction or tangential springs that it has not, a restitution of 0.
         """
         if law.friction is not None and not self.friction:
             return "has no friction"

@@ -64,7 +64,10 @@ class SceneAdvice(Tabular):
     blocks: tuple[ContactBlock, ...]
 
     def reason(self, contact: int) -> str:
-        """Phrase: the reason why this contact (from 0) is kept or left out."""
+        """Phrase: the reason why this contact (from 0) is kept or left out: its effect
+        is small or none, it is open, nothing approaches in its block, or it has no
+        impulse.
+        """
         if contact in self.kept:
             return "kept"
         if self.errors[contact] > 0:

@@ -224,7 +224,8 @@ def _where(condition: Any, yes: Any, no: Any) -> Any:
 
 def field_of(problem: Scaled) -> Field:
     """Right-hand sides of a dimensionless impact; G as sparse as its contacts are
-    coupled.
+    coupled: tridiagonal of a chain, by neighbours of a packing, else dense. Without
+    friction there are no tangents.
     """
     dynamics = problem.dynamics
     inputs = problem.dynamics.problem

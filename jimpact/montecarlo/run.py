@@ -246,8 +246,8 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 def _computed_chunks(
     executor: Any, workers: int, run: Run, tasks: Iterable[Task]
 ) -> Generator[Chunk]:
-    """Chunks `run(task)` of all tasks, in their order, by 'threads', 'serial' or an
-    executor.
+    """Chunks `run(task)` of all tasks, in their order: by as many threads as `workers`,
+    by one ('serial'), or by the `map` of another executor, WINDOW tasks at a time.
     """
     if executor in ("threads", "serial"):
         yield from in_threads(run, tasks, workers if executor == "threads" else 1)

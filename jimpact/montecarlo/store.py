@@ -50,6 +50,11 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
     """A value as nested tuples of texts and bytes, equal for equal values, to be
     hashed.
 
+    Its type, and by that: numbers and texts, bytes and shape of arrays, the parts of
+    collections (sorted where they have no order), of `partial` and bound methods;
+    source, defaults and closure of a function; the name of a class; the attributes of
+    other objects, else what pickles of them. What cannot be pickled is its type alone.
+
     `inside` are the ids of the objects that hold it: one that holds itself, as a
     recursive function does, is named there, not entered again.
     """

@@ -307,8 +307,8 @@ def start_by(
 def tolerances(
     method: EventDriven | ContactForces, dtype: jnp.dtype
 ) -> tuple[float, float]:
-    """Relative and absolute tolerance of the flights, those of the precision by
-    default.
+    """Relative and absolute tolerance of the flights: the method's, each by default
+    that of the precision. ValueError: an `rtol` of 'events' below rounding.
     """
     rtol, atol = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
     if method.rtol is not None:

@@ -196,8 +196,8 @@ def _shown_contacts(
     bodies: Sequence[int] | None,
     contacts: Sequence[int] | None,
 ) -> list[int] | None:
-    """Contacts (from 0) that were chosen, by number or by their bodies; None: no
-    choice.
+    """Contacts (from 0) that were chosen, by number, else by one of their bodies; None:
+    no choice, or a body that does not say which bodies touch.
     """
     count = motion.gaps.shape[1]
     if contacts is not None:
@@ -322,7 +322,7 @@ def base_path(system: System, time: np.ndarray) -> np.ndarray:
 
 def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
     """Draw the displacement of the base over time, a line for each direction in which
-    it moves.
+    it moves; nothing without a base, or where no sample was reached.
     """
     if system.base is None:
         return

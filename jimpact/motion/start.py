@@ -226,11 +226,13 @@ def _check_values_at_start(
 def _with_closures_as_leaves(
     system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
 ) -> System:
-    """System in which traced arrays that its functions close over are leaves."""
+    """System in which traced arrays that its functions close over are leaves; functions
+    that close over none stay as they are.
+    """
 
     def converted(function: Any, *args: jax.Array) -> Any:
         """Function as a pytree of the arrays that it closes over, if they are
-        traced.
+        traced; else, and of modules of Equinox, the function.
         """
         if isinstance(function, eqx.Module) or not callable(function):
             return function
@@ -277,7 +279,10 @@ def _friction_of(
     system: System, law: Law, here: _AtStart
 ) -> Float[Array, "..."] | None:
     """Coefficients mu (m,), () of a pile: of the system, or else of the law; None if
-    all are 0.
+    there are none or all are 0.
+
+    Traced ones below 0 become NaN: the motion is `not_finite` then. ValueError: for
+    friction without tangents, or other shapes.
     """
     own = system.friction is not None
     if own:

@@ -233,6 +233,9 @@ def contacts_of_step(
 def check_stepped_law(system: System, law: Law, contacts: int, joint: bool) -> None:
     """Raise unless time stepping of the system can use the law; `joint` as in
     `time_stepping`.
+
+    A pile needs a joint law with one number for all contacts; other joint laws have one
+    for all or for each contact. Laws that are not joint suit all other systems.
     """
     if not joint:
         if is_pile(system):

@@ -628,6 +628,9 @@ def _recorded_impact(
 ) -> Events:
     """Events with one row more where a contact strikes in this step; a pile records
     none.
+
+    Velocities and impulses are those of the law alone; of a joint step those at its
+    end, with the impulses of contacts that rest.
     """
     contacts = setup.contacts
     x = setup.law_impulse

@@ -645,10 +645,8 @@ def _orthogonal(
         largest = jnp.maximum(largest, jnp.max(angle))
         if places == 2:
             return Sweep(x, y, largest, done)
-        kept_places = x[:, 1:-1]
-        first = jnp.concatenate([x[:, :1], y[:, :1], kept_places], axis=1)
-        partners = jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1)
-        return Sweep(first, partners, largest, done)
+        x, y = _moved_on(x, y)
+        return Sweep(x, y, largest, done)
 
     def sweep(at: Sweep) -> Sweep:
         """State after a sweep: as many rounds as make each column meet each other
@@ -670,6 +668,16 @@ def _orthogonal(
     with_padding = jnp.concatenate([end.first, end.second], axis=1)
     both = with_padding[:, :n]
     return _by_falling_length(both[:n], both[n:])
+
+
+def _moved_on(
+    x: Float[Array, "entries pairs B"], y: Float[Array, "entries pairs B"]
+) -> tuple[Float[Array, "entries pairs B"], Float[Array, "entries pairs B"]]:
+    """Two rows of columns whose columns but the first move on by one place, round."""
+    kept_places = x[:, 1:-1]
+    first = jnp.concatenate([x[:, :1], y[:, :1], kept_places], axis=1)
+    second = jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1)
+    return first, second
 
 
 def _by_falling_length(

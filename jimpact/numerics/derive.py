@@ -206,7 +206,7 @@ class _WithTangents:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         """f(x), then the rates `sum_i (df / dx_i) t_i` in each direction t (a tangent
-        of JAX).
+        of JAX): `many` (D, .., B) of them, or one (.., B).
         """
         values = arrays[: len(self.marked)]
         directions = arrays[len(self.marked) :]

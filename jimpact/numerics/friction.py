@@ -584,7 +584,11 @@ def _at_rest(
     problem: _FrictionProblem, x: Float[Array, "m b"], margin: Float[Array, ""]
 ) -> _Modes:
     """The modes (N = 1) that x has, where contacts stick that slip by less than
-    `margin`.
+    `margin` times the size of x.
+
+    Contacts take part where r is at most the margin, all where they may not part; one
+    whose load only begins, and that does not press, leaves. Of those that take part and
+    push, or have a load, the fast ones slide and the others stick, if they rub.
     """
     rate = _rates(problem, x[..., None])  # (r, s)
     margin = (margin * _size(x[..., None]))[None]

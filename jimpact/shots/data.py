@@ -156,20 +156,7 @@ class Experiments(eqx.Module):
             )
         of_shots = np.broadcast_to(lost_freedom, len(measured))
         self.lost = tuple(of_shots.tolist())
-        n = measured.shape[1]
-        if units is None:
-            units = LINEAR
-        if isinstance(units, str):
-            self.units = (units,) * n
-        else:
-            self.units = tuple(units)
-        known = set(self.units) <= {LINEAR, ANGULAR}
-        if len(self.units) != n or not known:
-            raise ValueError(
-                f"Argument `units` must have {n} entries, each '{LINEAR}' or "
-                f"'{ANGULAR}', but has value {units!r}: convert velocities to these (1 "
-                f"cm/s = 0.01 m/s)."
-            )
+        self.units = _as_units(units, measured.shape[1])
 
     def __str__(self) -> str:
         """Number of shots, units, missing values, the range of sigma, and the first
@@ -604,6 +591,26 @@ def _as_rows(name: str, value: Any) -> jax.Array:
             f"but has shape {tuple(array.shape)}."
         )
     return array
+
+
+def _as_units(units: Sequence[str] | None, n: int) -> tuple[str, ...]:
+    """Units of n velocities, m/s or rad/s: those given, or one for all; None: m/s.
+
+    ValueError: other units, or another number of them.
+    """
+    if units is None:
+        units = LINEAR
+    if isinstance(units, str):
+        each: tuple[str, ...] = (units,) * n
+    else:
+        each = tuple(units)
+    if len(each) != n or not set(each) <= {LINEAR, ANGULAR}:
+        raise ValueError(
+            f"Argument `units` must have {n} entries, each '{LINEAR}' or "
+            f"'{ANGULAR}', but has value {units!r}: convert velocities to these (1 "
+            f"cm/s = 0.01 m/s)."
+        )
+    return each
 
 
 def _as_sigma(

@@ -56,7 +56,12 @@ class CappedPolyhedron(NamedTuple):
         return point + step
 
     def lowest(self, direction: np.ndarray) -> np.ndarray:
-        """A point w (d,) of the set where `direction . w` is least."""
+        """A point w (d,) of the set where `direction . w` is least.
+
+        Of direction 0, or of a set that is a point, the one nearest to the origin. Else
+        `argmin c . w + |w|^2 / (2 s)` of the polyhedron, c the unit direction, with the
+        s at which it reaches the ball, or at which c . w has its minimum without one.
+        """
         from scipy.optimize import brentq  # late: slow to import
 
         length = np.linalg.norm(direction)
