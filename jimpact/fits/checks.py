@@ -88,13 +88,16 @@ class Judged:
         minimum = solution.starts[0]
         measured = ~np.isnan(problem.measured).ravel()
         # of each value
-        shot = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
-        self.shot = np.append(shot, np.full(len(problem.priors), NO_SHOT))
+        rows = np.atleast_1d(problem.measured)
+        shot, *_ = np.nonzero(~np.isnan(rows))
+        of_priors = np.full(len(problem.priors), NO_SHOT)
+        self.shot = np.append(shot, of_priors)
         self.shots = np.unique(shot)
         self.used = used = np.append(measured, np.ones(len(problem.priors), bool))
         # not the residual of the search, which is a penalty where the law fails
         errors = problem.measurement.independent(problem.measured - solution.predicted)
-        self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
+        of_priors = -minimum.residual[errors.size :]
+        self.residual = np.append(errors, of_priors)[used]
         self.jacobian = minimum.jacobian[used]
         self.squares = float(self.residual @ self.residual)
         self.errors = uncertainty(problem, minimum)
@@ -129,8 +132,10 @@ class Judged:
         tests = [(squares, freedom)]  # chi^2 and its degrees of freedom
         if data is not None and not data.lost_freedom:
             momentum = self.momentum
-            squares -= float(np.sum((momentum.T @ self.residual) ** 2))
-            tests.append((max(squares, 0.0), freedom - momentum.shape[1]))
+            projections = momentum.T @ self.residual
+            squares -= float(np.sum(projections**2))
+            left = freedom - momentum.shape[1]
+            tests.append((max(squares, 0.0), left))
         rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
         return float(np.sqrt(max(rejected, default=1.0)))
 
@@ -140,7 +145,8 @@ class Judged:
         sparse.
         """
         of_priors = np.zeros((len(self.problem.priors), 0))
-        blocks = [coo_array(block) for block in (*_conserved(self.problem), of_priors)]
+        blocks_of_shots = _conserved(self.problem)
+        blocks = [coo_array(block) for block in (*blocks_of_shots, of_priors)]
         return block_diag(blocks, format="csr")[self.used]
 
     @property
@@ -179,7 +185,8 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     )
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
-    return used & (np.array(fails) | ~(slope <= allowed).all(axis=(1, 2)))
+    usable_slopes = (slope <= allowed).all(axis=(1, 2))
+    return used & (np.array(fails) | ~usable_slopes)
 
 
 def _conserved(problem: FitProblem) -> list[np.ndarray]:
@@ -196,7 +203,8 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
     mixing = problem.measurement.mixing
     weights = np.asarray(problem.measurement.weight, float)
     # rows = C^T M (c, n)
-    for k, ((rows, _, _), weight) in enumerate(zip(balances, weights)):
+    both = zip(balances, weights)
+    for k, ((rows, _, _), weight) in enumerate(both):
         complete = (weight > 0).all() and len(rows)
         if complete:
             directions = (rows / weight).T
@@ -207,7 +215,8 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
                 block = mixing[k]
             else:
                 block = mixing[k, :, k]
-            directions = np.linalg.solve(np.asarray(block, float).T, directions)
+            matrix = np.asarray(block, float).T
+            directions = np.linalg.solve(matrix, directions)
         bases.append(np.linalg.qr(directions)[0])
     return bases
 
@@ -237,7 +246,8 @@ def _pure_error(judged: Judged) -> tuple[float, int]:
     count = 0
     for shots in groups.values():
         blocks = [judged.residual[judged.shot == k] for k in shots]
-        complete = np.array([block for block in blocks if len(block) == n])
+        whole = [block for block in blocks if len(block) == n]
+        complete = np.array(whole)
         if len(complete) == 0:
             continue
         # equal to the last digit: their noise is hidden
@@ -246,7 +256,8 @@ def _pure_error(judged: Judged) -> tuple[float, int]:
         mean = complete.mean(axis=0)
         basis = conserved[shots[0]]
         squares += float(np.sum((complete - mean) ** 2))
-        squares += len(complete) * float(np.sum((basis.T @ mean) ** 2))
+        conserved_part = basis.T @ mean
+        squares += len(complete) * float(np.sum(conserved_part**2))
         count += (len(complete) - 1) * n + basis.shape[1]
         if experiments.lost_freedom:  # the momentum of every shot has been corrected
             count -= len(complete) * basis.shape[1]
@@ -259,10 +270,12 @@ def _reading_variance(problem: FitProblem) -> float:
 
     0 for readings of nine decimals or more.
     """
-    values = np.asarray(problem.measured, float)[~np.isnan(problem.measured)]
+    measured = np.asarray(problem.measured, float)
+    values = measured[~np.isnan(problem.measured)]
     largest = np.abs(values).max()
     for digits in range(9):
-        if np.abs(values - values.round(digits)).max() <= ROUNDING * largest:
+        errors = np.abs(values - values.round(digits))
+        if errors.max() <= ROUNDING * largest:
             return (
                 float(problem.measurement.weight.max()) ** 2
                 * 10.0 ** (-2 * digits)
@@ -315,7 +328,8 @@ def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
     identical = kept_by_corrections(data, judged.problem.scene) == np.eye(
         data.pre.shape[1]
     )
-    unknown = np.flatnonzero((np.array(data.lost) > 0) & identical.all(axis=(1, 2)))
+    corrected = np.array(data.lost) > 0
+    unknown = np.flatnonzero(corrected & identical.all(axis=(1, 2)))
     if unknown.size:
         labels = tuple(data.shots[k] for k in unknown)
         yield Finding(
@@ -397,7 +411,8 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
     minimum.
     """
     problem = judged.problem
-    lost = np.isfinite(problem.measured) & ~np.isfinite(judged.solution.predicted)
+    predicted = np.isfinite(judged.solution.predicted)
+    lost = np.isfinite(problem.measured) & ~predicted
     if problem.experiments is None and lost.any():
         which = np.flatnonzero(lost)
         values = problem.values - len(problem.priors)
@@ -504,9 +519,11 @@ def _linear_in_velocities(judged: Judged) -> Iterator[Finding]:
     pre = np.asarray(problem.experiments.pre, float)
     u, singular, _ = np.linalg.svd(pre, full_matrices=False)
     basis = u[:, singular > ROUNDING * singular[0]]  # of the columns of v-, over shots
-    body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
+    number = np.arange(pre.shape[1])
+    body = np.broadcast_to(number, problem.measured.shape)
     body = body[~np.isnan(problem.measured)]  # the body of each residual
-    of_bodies = [basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])]
+    of_shots = basis[judged.shot]
+    of_bodies = [of_shots * (body == i)[:, None] for i in range(pre.shape[1])]
     regressors = np.hstack(of_bodies)
     momentum = judged.momentum
     # no law explains momentum errors
@@ -547,12 +564,14 @@ def _contradicted_priors(judged: Judged) -> Iterator[Finding]:
     if not judged.inexact:
         return
     basis = _range(problem, judged.jacobian)
-    for row, prior in zip(np.flatnonzero(judged.shot == NO_SHOT), problem.priors):
+    of_priors = np.flatnonzero(judged.shot == NO_SHOT)
+    for row, prior in zip(of_priors, problem.priors):
         # of the residual; 0: the prior decides
         variance = 1 - float(basis[row] @ basis[row])
         if variance <= RANK_TOLERANCE[problem.precision]:
             continue
-        far = float(abs(judged.residual[row]) / np.sqrt(variance))
+        distance = abs(judged.residual[row])
+        far = float(distance / np.sqrt(variance))
         if chdtrc(1, far**2) < LEVEL / len(problem.priors):
             name = problem.names[prior.parameter]
             yield Finding(
@@ -582,7 +601,8 @@ def _suspicious(judged: Judged) -> Iterator[Finding]:
     ]
     if not suspects:
         return
-    worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:LISTED])
+    worst_first = sorted(suspects, reverse=True)[:LISTED]
+    worst = ", ".join(label for _, label in worst_first)
     if len(suspects) > LISTED:
         worst += f" and {len(suspects) - LISTED} more"
     else:
@@ -637,7 +657,8 @@ def _against_others(judged: Judged) -> Iterable[tuple[int, float, float]]:
             squares = float(r @ r)
             noise = median**2 * len(judged.residual) / freedom
         else:
-            squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
+            projector = np.eye(n) - q @ q.T
+            squares = float(r @ np.linalg.lstsq(projector, r, rcond=1e-9)[0])
             noise = max(judged.squares - squares, 0.0) / freedom_left
         noise = max(noise + reading, 0.0 if problem.sigma is None else 1.0)
         yield (
@@ -692,9 +713,8 @@ def _choices(judged: Judged) -> Iterator[Finding]:
     minima = judged.solution.starts
     noise = np.nan_to_num(judged.errors.noise)
     more = max(EQUALLY_GOOD * noise**2, judged.problem.exact_squares)
-    several = sum(
-        end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima
-    )
+    least = minima[0].sum_of_squares
+    several = sum(end.sum_of_squares <= least + more for end in minima)
     if rank < count:
         yield Finding(
             "undetermined",
@@ -761,7 +781,8 @@ def fit_findings(judged: Judged) -> list[Finding]:
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         law = problem.law
-        stored = float(np.sum(np.broadcast_to(np.asarray(law.stored), contacts)))
+        stored_of_contacts = np.broadcast_to(np.asarray(law.stored), contacts)
+        stored = float(np.sum(stored_of_contacts))
         balances = DataBalances(data, problem.scene, stored, law.uses_gaps)
         found += findings(DATA_CHECKS, balances)
     return found + findings(FIT_CHECKS, judged)

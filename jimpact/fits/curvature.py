@@ -45,7 +45,8 @@ def mean_of_residuals(judged: Judged) -> Float[np.ndarray, "K n"]:
     assert solution.slopes is not None
     covariance = problem.before.covariance_of_true(solution.slopes)
     variances, directions = np.linalg.eigh(covariance)
-    steps = directions * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    steps = directions * deviations[:, None, :]
     x = np.asarray(solution.value, problem.dtype)
     bare = problem.without_host()
 
@@ -58,7 +59,8 @@ def mean_of_residuals(judged: Judged) -> Float[np.ndarray, "K n"]:
     bends = np.zeros_like(middle)
     for i in range(steps.shape[2]):
         step = steps[:, :, i]
-        bends += law_at(solution.pre + step) - 2 * middle + law_at(solution.pre - step)
+        ahead = law_at(solution.pre + step)
+        bends += ahead - 2 * middle + law_at(solution.pre - step)
     return np.nan_to_num(-0.5 * bends)
 
 
@@ -66,8 +68,10 @@ def bias(judged: Judged) -> Float[np.ndarray, " P"]:
     """Bias of the parameters by `mean_of_residuals`, by linear propagation."""
     mean = judged.problem.measurement.independent(mean_of_residuals(judged))
     # residuals are predicted less measured; those of priors have no mean
-    rows = np.append(-mean.ravel(), np.zeros(len(judged.problem.priors)))[judged.used]
-    scaled = np.linalg.lstsq(judged.jacobian, -rows, rcond=1e-9)[0]
+    of_priors = np.zeros(len(judged.problem.priors))
+    rows = np.append(-mean.ravel(), of_priors)[judged.used]
+    solved = np.linalg.lstsq(judged.jacobian, -rows, rcond=1e-9)
+    scaled = solved[0]
     return scaled * judged.problem.steps_at(judged.solution.value)
 
 
@@ -80,7 +84,8 @@ def bent_within_errors(judged: Judged) -> Iterator[Finding]:
     size = bias(judged)
     error = judged.errors.standard_error
     known = np.isfinite(error) & (error > 0)
-    worth = known & (np.abs(size) > WORTH_NAMING * np.where(known, error, np.inf))
+    allowed = WORTH_NAMING * np.where(known, error, np.inf)
+    worth = known & (np.abs(size) > allowed)
     names = judged.problem.names
     parts = [f"{names[i]} by about {size[i]:+.2g}" for i in np.flatnonzero(worth)]
     if parts:

@@ -118,12 +118,12 @@ class DataBalances:
         self.energies: list[_Defect] = []
         count, n = experiments.pre.shape
         # covariance of (v-, v+); where it is not known, v+ have errors of 1 m/s
-        joint = np.tile(np.diag(np.repeat([0.0, 1.0], n)), (count, 1, 1))
+        variances = np.repeat([0.0, 1.0], n)
+        joint = np.tile(np.diag(variances), (count, 1, 1))
         if experiments.joint is not None:
             joint = diagonal_blocks(experiments.joint, 2 * n)
-        balances = zip(
-            experiments.balances(scene), experiments.each(scene, dense_mass), joint
-        )
+        masses = experiments.each(scene, dense_mass)
+        balances = zip(experiments.balances(scene), masses, joint)
         for k, ((rows, pre, post), mass, covariance) in enumerate(balances):
             if np.isnan(post).any():
                 continue
@@ -147,16 +147,15 @@ class DataBalances:
             else:
                 ratio = np.nan
             error = _error(np.append(-mass @ pre, mass @ post), covariance)
-            self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, error))
+            of_energy = _Defect(k, gain, t_minus, t_minus, ratio, error)
+            self.energies.append(of_energy)
 
     def approaching(self, normals_of: Callable[[Scene], np.ndarray]) -> np.ndarray:
         """True for shots (K,) in which one of the contacts with these normals
         approaches.
         """
-        pairs = zip(
-            self.experiments.each(self.scene, normals_of),
-            np.asarray(self.experiments.pre),
-        )
+        of_shots = self.experiments.each(self.scene, normals_of)
+        pairs = zip(of_shots, np.asarray(self.experiments.pre))
         return np.array([_approaches(normals, pre) for normals, pre in pairs])
 
     def labels(self, shots: Iterable[int]) -> tuple[str, ...]:
@@ -192,17 +191,18 @@ class DataBalances:
             level: how often honest shots may be reported together.
             gains: only excesses > 0 count.
         """
-        _, excess, scale, before, _, error = np.array(defects).reshape(-1, 6).T
+        rows = np.array(defects).reshape(-1, 6)
+        _, excess, scale, before, _, error = rows.T
         if gains:
             size = excess
         else:
             size = np.abs(excess)
         has_sigma = self.experiments.sigma is not None
-        sigmas = max(
-            DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / max(len(defects), 1)))
-        )
+        count = max(len(defects), 1)
+        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / count)))
         beyond = size > (sigmas * error if has_sigma else DEFECT_TOLERANCE * scale)
-        flagged = {d.k: d.ratio for d, far in zip(defects, beyond) if far}
+        pairs = zip(defects, beyond)
+        flagged = {d.k: d.ratio for d, far in pairs if far}
         if (
             has_sigma
             or len(defects) < 2
@@ -220,9 +220,8 @@ class DataBalances:
         weight = 1 / error[has_error]
         # excess / error is compared with a constant, and with before / error
         shapes = np.sign(weight), weight * before[has_error]
-        chance = min(
-            _p_value(weight * excess[has_error], shape, gains) for shape in shapes
-        )
+        weighted = weight * excess[has_error]
+        chance = min(_p_value(weighted, shape, gains) for shape in shapes)
         if chance < level / len(shapes):
             return flagged
         return {}
@@ -241,18 +240,15 @@ class DataBalances:
             np.array([d.excess / d.error for d in each if d.error > 0])
             for each in groups
         ]
-        noise = np.sqrt(
-            np.mean([_shorter_half(each) ** 2 for each in values if len(each)])
-        )
-        freedom = _EFFICIENCY_OF_HALF * sum(
-            len(each) - 1 for each in values if len(each)
-        )
+        squares = [_shorter_half(each) ** 2 for each in values if len(each)]
+        noise = np.sqrt(np.mean(squares))
+        degrees_of_freedom = sum(len(each) - 1 for each in values if len(each))
+        freedom = _EFFICIENCY_OF_HALF * degrees_of_freedom
         if freedom == 0:
             return set()
         apart = noise * float(stdtrit(freedom, 1 - OUTLIER_LEVEL / len(gains)))
-        least = max(
-            noise * float(ndtri(1 - DEFECT_LEVEL)), np.median(values[0]) + apart
-        )
+        of_level = noise * float(ndtri(1 - DEFECT_LEVEL))
+        least = max(of_level, np.median(values[0]) + apart)
         return {d.k for d in gains if d.error > 0 and d.excess / d.error > least}
 
 
@@ -288,7 +284,8 @@ def _units(data: DataBalances) -> Iterator[Finding]:
     else:
         what = "root of the energy"
         values = gains
-    if not values or len(values) < 0.5 * max(len(ratios), len(data.energies)):
+    balances = max(len(ratios), len(data.energies))
+    if not values or len(values) < 0.5 * balances:
         return
     ratio = float(np.median(values))
     for factor, unit in UNIT_FACTORS.items():
@@ -387,13 +384,15 @@ def _copies(data: DataBalances) -> Iterator[Finding]:
     experiments = data.experiments
     if experiments.scenes is not None or experiments.sigma is not None:
         return
-    rows = np.hstack(
-        [np.asarray(experiments.pre, float), np.asarray(experiments.post, float)]
-    )
-    size = np.sqrt(np.nansum(rows**2, axis=1, keepdims=True))
-    unit = np.nan_to_num(rows / np.where(size > 0, size, 1.0), nan=np.inf)
+    pre = np.asarray(experiments.pre, float)
+    rows = np.hstack([pre, np.asarray(experiments.post, float)])
+    squares = np.nansum(rows**2, axis=1, keepdims=True)
+    size = np.sqrt(squares)
+    scaled = rows / np.where(size > 0, size, 1.0)
+    unit = np.nan_to_num(scaled, nan=np.inf)
     # the median is the row that more than half have in common, if there is one
-    same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=ROUNDING).all(axis=1)
+    median = np.median(unit, axis=0)
+    same = np.isclose(unit, median, rtol=0, atol=ROUNDING).all(axis=1)
     count = int(same.sum())
     total = data.total
     if 2 * count > total > 1:
@@ -413,9 +412,8 @@ def _approaches(normals: np.ndarray, before: np.ndarray) -> bool:
     """True where a contact of normals (n, c) approaches: `N^T v- < 0` by more than
     rounding.
     """
-    return bool(
-        (normals.T @ before < -ROUNDING * np.abs(normals).T @ np.abs(before)).any()
-    )
+    rounding = -ROUNDING * np.abs(normals).T @ np.abs(before)
+    return bool((normals.T @ before < rounding).any())
 
 
 DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)

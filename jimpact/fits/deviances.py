@@ -75,13 +75,13 @@ class Grid(NamedTuple):
 
     def at(self, cell: Index) -> list[float]:
         """The values of the parameters at a cell."""
-        return [float(values[k]) for values, k in zip(self.values, cell)]
+        places = zip(self.values, cell)
+        return [float(values[k]) for values, k in places]
 
     def nearest(self, y: Float[np.ndarray, " Q"]) -> Index:
         """The cell nearest to y."""
-        return tuple(
-            int(np.abs(v - y[i]).argmin()) for i, v in zip(self.which, self.values)
-        )
+        axes = zip(self.which, self.values)
+        return tuple(int(np.abs(v - y[i]).argmin()) for i, v in axes)
 
     def neighbours(self, cell: Index) -> list[Index]:
         """Cells adjacent to one, diagonal ones too."""
@@ -169,9 +169,8 @@ class Deviances:
         """
         points = np.array([y for _, _, y in trials])
         # of the Q entries of y the first P are parameters, and the others stay
-        fixed = np.tile(
-            np.arange(points.shape[1]) >= len(self.fit.names), (len(points), 1)
-        )
+        is_constant = np.arange(points.shape[1]) >= len(self.fit.names)
+        fixed = np.tile(is_constant, (len(points), 1))
         for k, (which, values, _) in enumerate(trials):
             points[k, which] = values
             fixed[k, which] = True
@@ -186,12 +185,14 @@ class Deviances:
         )
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
-            self.lowest = Lowest(float(ends.squares[least]), ends.y[least])
+            squares = float(ends.squares[least])
+            self.lowest = Lowest(squares, ends.y[least])
         return ends
 
     def _is_below(self, squares: float, other: float) -> bool:
         """True if a sum of squares is less than another one by more than rounding."""
-        return bool(squares < other * (1 - self.same) - self.problem.exact_squares)
+        less = other * (1 - self.same)
+        return bool(squares < less - self.problem.exact_squares)
 
     def of(self, squares: float) -> float:
         """The deviance `(S - S_best) / s^2` of a sum of squares, at least 0."""
@@ -199,11 +200,8 @@ class Deviances:
 
     def values(self, i: int, y: Any) -> Any:
         """Values x_i of the i-th parameter from scaled values y_i."""
-        return unscaled(
-            y,
-            float(self.problem.variables.scale[i]),
-            bool(self.problem.variables.log[i]),
-        )
+        variables = self.problem.variables
+        return unscaled(y, float(variables.scale[i]), bool(variables.log[i]))
 
     def reach(self, i: int) -> tuple[float, float]:
         """Scaled bounds of the i-th parameter; in the place of infinite ones, y_i -+
@@ -217,7 +215,8 @@ class Deviances:
         high = variables.high[i]
         if not np.isfinite(low):
             low = best - START_SCALES
-        return float(low), float(high if np.isfinite(high) else best + START_SCALES)
+        highest = high if np.isfinite(high) else best + START_SCALES
+        return float(low), float(highest)
 
     def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Lowest]]:
         """Minima by cell, for each grid: a flood fill from `starts` until deviances
@@ -285,9 +284,9 @@ def profiles_of(
     with progress_bar(progress) as show:
         lines = Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(
-                find_minima(fit.problem, points, fit.seed, Solver(show=show)).starts
-            )
+            solver = Solver(show=show)
+            minima = find_minima(fit.problem, points, fit.seed, solver)
+            lines.add_starts(minima.starts)
         for _ in range(ROUNDS):
             profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:
@@ -329,14 +328,17 @@ class Lines(Deviances):
         widest = FIRST_SHARE * (high - low)
         if not 0 < first < widest:
             first = widest
-        count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
-        away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
+        growths = (GROWTH - 1) * (high - low) / first
+        count = np.log(1 + growths) / np.log(GROWTH)
+        powers = GROWTH ** np.arange(1, count + 1)
+        away = first * (powers - 1) / (GROWTH - 1)
         near = centres[:, None] + np.concatenate([-away, away])  # a row for each start
-        owner = np.abs(near[..., None] - centres).argmin(axis=-1)  # the nearest start
-        near = near[
-            (owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)
-        ]
-        return Grid((i,), (np.unique([*centres, low, high, *near]),))
+        distances = np.abs(near[..., None] - centres)
+        owner = distances.argmin(axis=-1)  # the nearest start
+        own = owner == np.arange(len(centres))[:, None]
+        near = near[own & (near > low) & (near < high)]
+        values = np.unique([*centres, low, high, *near])
+        return Grid((i,), (values,))
 
     def profiles(self, which: Sequence[int], level: float) -> tuple[Profile, ...]:
         """Profiles of the parameters of these indices.
@@ -365,13 +367,15 @@ class Lines(Deviances):
                     trials += [(n, value, line[end].y) for end in (inside, outside)]
             if not trials:
                 break
-            ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
+            trials_of_lines = [((which[n],), (value,), y) for n, value, y in trials]
+            ends = self.minimize(trials_of_lines)
             for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 end = Lowest(squares, y)
                 lines[n][value] = min(
                     lines[n].get(value, end), end, key=lambda e: e.squares
                 )
-        return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
+        lines_of_parameters = zip(which, lines)
+        return tuple(self.profile(i, line, level) for i, line in lines_of_parameters)
 
     def _crossings(self, line: dict[float, Lowest]) -> Iterator[_Crossing]:
         """Neighbouring values between which the deviance passes the limit, if not near
@@ -383,8 +387,10 @@ class Lines(Deviances):
         values, deviance = self.deviance(line)
         height = np.sqrt(deviance / self.limit) - 1
         inside = values[deviance <= self.limit]
-        least = END * max(np.ptp(inside), END * abs(inside[0]))
-        for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
+        width = np.ptp(inside)
+        least = END * max(width, END * abs(inside[0]))
+        below = height <= 0
+        for k in np.flatnonzero(below[:-1] != below[1:]):
             if height[k] <= 0:
                 a = k
                 b = k + 1
@@ -399,7 +405,8 @@ class Lines(Deviances):
     ) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
         """Fixed values in order, and their deviances."""
         values = sorted(line)
-        return np.array(values), np.array([self.of(line[y].squares) for y in values])
+        deviances = [self.of(line[y].squares) for y in values]
+        return np.array(values), np.array(deviances)
 
     def profile(self, i: int, line: dict[float, Lowest], level: float) -> Profile:
         """The profile of parameter i from the minima at its fixed values, `line`.
@@ -418,9 +425,8 @@ class Lines(Deviances):
             )
             for piece in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         )
-        is_of_fit = np.array_equal(
-            self.best.y, self.problem.variables.point(self.fit.value)
-        )
+        point = self.problem.variables.point(self.fit.value)
+        is_of_fit = np.array_equal(self.best.y, point)
         return Profile(
             name=self.fit.names[i],
             value=self.values(i, y),
@@ -458,7 +464,8 @@ class Lines(Deviances):
         root = np.sqrt(deviance[k])
         root_beyond = np.sqrt(deviance[beyond])
         share = (np.sqrt(self.limit) - root) / (root_beyond - root)
-        return float(self.values(i, y[k] + share * (y[beyond] - y[k])))
+        crossing = y[k] + share * (y[beyond] - y[k])
+        return float(self.values(i, crossing))
 
 
 def lower_minimum(

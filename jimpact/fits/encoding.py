@@ -103,9 +103,8 @@ def decoded(data: Any) -> Any:
     if "class" in data:
         return instance_of(_class_of(data["class"]), data["fields"])
     if "array" in data:
-        array = np.array([decoded(x) for x in data["array"]], data["dtype"]).reshape(
-            data["shape"]
-        )
+        entries = [decoded(x) for x in data["array"]]
+        array = np.array(entries, data["dtype"]).reshape(data["shape"])
         if data["device"]:
             return jnp.asarray(array)
         return array

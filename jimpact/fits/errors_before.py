@@ -68,10 +68,10 @@ class ErrorsBefore:
             return cls(joint, kept, removed)
         # (shot, - or +, velocity), twice
         parts = joint.reshape(count, 2, n, count, 2, n)
-        whole = parts.transpose(1, 0, 2, 4, 3, 5).reshape(
-            1, 2 * n * count, 2 * n * count
-        )
-        return cls(whole, _block_diagonal(kept, 1, np), _block_diagonal(removed, 1, np))
+        side = 2 * n * count
+        whole = parts.transpose(1, 0, 2, 4, 3, 5).reshape(1, side, side)
+        kept_of_all = _block_diagonal(kept, 1, np)
+        return cls(whole, kept_of_all, _block_diagonal(removed, 1, np))
 
     def filled(self, shots: Int[np.ndarray, " F"]) -> "ErrorsBefore":
         """F >= K shots by their indices: all K of them, then copies of the last one.
@@ -85,25 +85,23 @@ class ErrorsBefore:
         if not copies:
             return self
         if groups == count:
-            return ErrorsBefore(
-                self.covariance[shots], self.kept[shots], self.removed[shots]
-            )
+            of_shots = self.covariance[shots]
+            return ErrorsBefore(of_shots, self.kept[shots], self.removed[shots])
         size = self.kept.shape[-1]
         more = copies * size // count
         halves = self.covariance.reshape(1, 2, size, 2, size)
         wider = ((0, 0), (0, 0), (0, more), (0, 0), (0, more))
-        covariance = np.pad(halves, wider).reshape(
-            1, 2 * (size + more), 2 * (size + more)
-        )
+        side = 2 * (size + more)
+        covariance = np.pad(halves, wider).reshape(1, side, side)
         square = ((0, 0), (0, more), (0, more))
-        return ErrorsBefore(
-            covariance, np.pad(self.kept, square), np.pad(self.removed, square)
-        )
+        wider_kept = np.pad(self.kept, square)
+        return ErrorsBefore(covariance, wider_kept, np.pad(self.removed, square))
 
     def standard_errors(self, shape: tuple[int, ...]) -> Float[AnyArray, "K n"]:
         """Those of v-, in the shape (K, n) of the shots."""
         size = self.kept.shape[1]
-        variances = self.covariance[:, :size, :size].diagonal(axis1=1, axis2=2)
+        before = self.covariance[:, :size, :size]
+        variances = before.diagonal(axis1=1, axis2=2)
         return (variances**0.5).reshape(shape)
 
     def drawn(
@@ -114,11 +112,11 @@ class ErrorsBefore:
         """
         covariance = np.asarray(self.covariance, float)
         variances, directions = np.linalg.eigh(covariance)
-        scale = directions * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+        deviations = np.sqrt(np.maximum(variances, 0.0))
+        scale = directions * deviations[:, None, :]
         groups, size = covariance.shape[:2]
-        errors = np.einsum(
-            "gij,bgj->bgi", scale, rng.normal(size=(shape[0], groups, size))
-        )
+        drawn = rng.normal(size=(shape[0], groups, size))
+        errors = np.einsum("gij,bgj->bgi", scale, drawn)
         before, after = np.split(errors, 2, axis=2)
         return before.reshape(shape), after.reshape(shape)
 
@@ -130,7 +128,8 @@ class ErrorsBefore:
         """
         groups, size = self.kept.shape[:2]
         difference = (post - pre).reshape(-1, groups, size)
-        kept = np.einsum("gij,bgj->bgi", np.asarray(self.kept, float), difference)
+        projectors = np.asarray(self.kept, float)
+        kept = np.einsum("gij,bgj->bgi", projectors, difference)
         return pre + kept.reshape(post.shape)
 
     def propagated(
@@ -139,9 +138,12 @@ class ErrorsBefore:
         """A and C of each group, at these J (`slope`)."""
         groups, size = self.kept.shape[:2]
         slopes = _block_diagonal(slope, groups, xp)
-        identity = xp.broadcast_to(xp.eye(size, dtype=slopes.dtype)[None], slopes.shape)
-        gain = self.kept @ xp.concatenate([-slopes, identity], axis=2)
-        return gain, gain @ self.covariance @ gain.swapaxes(1, 2) + self.removed
+        one = xp.eye(size, dtype=slopes.dtype)[None]
+        identity = xp.broadcast_to(one, slopes.shape)
+        both = xp.concatenate([-slopes, identity], axis=2)
+        gain = self.kept @ both
+        spread = gain @ self.covariance @ gain.swapaxes(1, 2)
+        return gain, spread + self.removed
 
     def covariance_after(
         self, slope: Float[np.ndarray, "K n n"]
@@ -149,9 +151,8 @@ class ErrorsBefore:
         """C of each shot, or of all; J that are not finite count as the identity."""
         count, n = slope.shape[:2]
         covariance = np.asarray(self.propagated(_finite_slope(slope, np))[1])
-        return covariance.reshape(
-            (count, n, n) if len(covariance) == count else (count, n) * 2
-        )
+        shape = (count, n, n) if len(covariance) == count else (count, n) * 2
+        return covariance.reshape(shape)
 
     def covariance_of_true(
         self, slope: Float[np.ndarray, "K n n"]
@@ -162,8 +163,10 @@ class ErrorsBefore:
         count, n = slope.shape[:2]
         gain, covariance = self.propagated(_finite_slope(slope, np))
         size = gain.shape[1]
-        cross = (np.asarray(self.covariance, float) @ gain.swapaxes(1, 2))[:, :size]
-        explained = cross @ np.linalg.solve(covariance, cross.swapaxes(1, 2))
+        whole = np.asarray(self.covariance, float)
+        cross = (whole @ gain.swapaxes(1, 2))[:, :size]
+        solved = np.linalg.solve(covariance, cross.swapaxes(1, 2))
+        explained = cross @ solved
         left = np.asarray(self.covariance, float)[:, :size, :size] - explained
         return diagonal_blocks(left if len(left) == count else left[0], n)
 
@@ -183,11 +186,12 @@ class ErrorsBefore:
         takes_part = row[:, :, None] & row[:, None, :]
         identity = jnp.eye(size, dtype=covariance.dtype)[None]
         covariance = jnp.where(takes_part, covariance, identity)
-        sigma = jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2))
-        factor = jnp.linalg.cholesky(
-            covariance / (sigma[:, :, None] * sigma[:, None, :])
-        )
-        cross = (self.covariance[:, :size] @ gain.swapaxes(1, 2)) / sigma[:, None, :]
+        variances = jnp.diagonal(covariance, axis1=1, axis2=2)
+        sigma = jnp.sqrt(variances)
+        sizes = sigma[:, :, None] * sigma[:, None, :]
+        factor = jnp.linalg.cholesky(covariance / sizes)
+        product = self.covariance[:, :size] @ gain.swapaxes(1, 2)
+        cross = product / sigma[:, None, :]
         return Whitener(sigma, factor, jnp.asarray(cross))
 
 
@@ -209,22 +213,24 @@ class Whitener(NamedTuple):
         """`a - x = (S A^T C^-1 r)_-` of errors `r = predicted - measured`."""
         independent = self.independent(error).reshape(self.sigma.shape)
         force = self._solved(independent, transposed=True)
-        return (self.cross @ force[:, :, None])[:, :, 0].reshape(error.shape)
+        moved = self.cross @ force[:, :, None]
+        return moved[:, :, 0].reshape(error.shape)
 
     def _solved(
         self, right: Float[Array, "G M"], transposed: bool
     ) -> Float[Array, "G M"]:
         """`F^-1 right`, or `F^-T right`."""
         solve = jax.scipy.linalg.solve_triangular
-        return jax.vmap(partial(solve, lower=True, trans=int(transposed)))(
-            self.factor, right
-        )
+        triangular = partial(solve, lower=True, trans=int(transposed))
+        return jax.vmap(triangular)(self.factor, right)
 
 
 def _finite_slope(slope: Float[AnyArray, "K n n"], xp: Any) -> Float[AnyArray, "K n n"]:
     """J of each shot; the identity where it has an entry that is not finite."""
-    finite = xp.isfinite(slope).all(axis=(1, 2), keepdims=True)
-    return xp.where(finite, slope, xp.eye(slope.shape[1], dtype=slope.dtype)[None])
+    is_finite = xp.isfinite(slope)
+    finite = is_finite.all(axis=(1, 2), keepdims=True)
+    identity = xp.eye(slope.shape[1], dtype=slope.dtype)
+    return xp.where(finite, slope, identity[None])
 
 
 def _block_diagonal(
@@ -236,5 +242,6 @@ def _block_diagonal(
     count, n, _ = blocks.shape
     members = count // groups
     grouped = blocks.reshape(groups, members, n, 1, n)
-    same = xp.eye(members, dtype=blocks.dtype)[None, :, None, :, None]
+    identity = xp.eye(members, dtype=blocks.dtype)
+    same = identity[None, :, None, :, None]
     return (grouped * same).reshape(groups, members * n, members * n)

@@ -125,7 +125,8 @@ class Estimate(Generic[AnyLaw]):
         used.
         """
         measured = np.isfinite(self.problem.measured)
-        return int(measured.any(axis=tuple(range(1, measured.ndim))).sum())
+        axes = tuple(range(1, measured.ndim))
+        return int(measured.any(axis=axes).sum())
 
     @property
     def start_count(self) -> int:
@@ -157,7 +158,8 @@ class Estimate(Generic[AnyLaw]):
             return squares + 2 * len(self.names)
         if squares <= self.problem.exact_squares:
             return np.nan
-        return float(values * np.log(squares / values) + 2 * (len(self.names) + 1))
+        parameters = len(self.names) + 1
+        return float(values * np.log(squares / values) + 2 * parameters)
 
     def quantile(self, level: float) -> float:
         """Half-width of a confidence interval of this `level`, in standard errors.
@@ -186,13 +188,16 @@ class Estimate(Generic[AnyLaw]):
         for minimum in self.starts[1:]:
             more = minimum.sum_of_squares - self.starts[0].sum_of_squares
             if minimum.standard_error is not None and more < (q * self.noise) ** 2:
-                minima.append((minimum.value[i], minimum.standard_error[i], more))
+                minimum_and_error = (minimum.value[i], minimum.standard_error[i], more)
+                minima.append(minimum_and_error)
         pieces = []
         for value, error, more in minima:
-            half = error * np.sqrt(q**2 - (more / self.noise**2 if more else 0.0))
+            share = more / self.noise**2 if more else 0.0
+            half = error * np.sqrt(q**2 - share)
             ends = value + np.array([-half, half])
             if self.problem.parameters.log[i]:
-                ends = value * np.exp(np.array([-half, half]) / value)
+                both_sides = np.array([-half, half]) / value
+                ends = value * np.exp(both_sides)
             pieces.append(tuple(np.clip(ends, low, high)))
         return joined(pieces)
 
@@ -224,10 +229,12 @@ class Estimate(Generic[AnyLaw]):
             return True
         if not np.isfinite(self.noise):
             return False  # the errors are unknown
-        wide = self.problem.parameters.log & (
-            self.standard_error > HARDLY_SEEN * self.value
-        )
+        hardly = HARDLY_SEEN * self.value
+        wide = self.problem.parameters.log & (self.standard_error > hardly)
         pieces = self.linearized_intervals(LEVEL)
-        low, high = np.array([(each[0][0], each[-1][1]) for each in pieces]).T
-        at_end = (low <= self.bounds[0]) | (high >= self.bounds[1])
-        return bool((wide | at_end).any()) or max(map(len, pieces)) > 1
+        ends = [(each[0][0], each[-1][1]) for each in pieces]
+        low, high = np.array(ends).T
+        at_low_end = low <= self.bounds[0]
+        at_end = at_low_end | (high >= self.bounds[1])
+        in_pieces = max(map(len, pieces)) > 1
+        return bool((wide | at_end).any()) or in_pieces

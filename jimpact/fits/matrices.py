@@ -87,7 +87,8 @@ class AdmissibleMatrices(eqx.Module):
         """`E = origin + map y` of each scene, with zeros for open contacts."""
         m = self.closed.shape[1]
         e = (self.origin + self.map @ y).reshape(m, m)
-        return e[None] * (self.closed[:, :, None] * self.closed[:, None, :])
+        both = self.closed[:, :, None] * self.closed[:, None, :]
+        return e[None] * both
 
     def elementwise(self, y: Float[Array, " Q"]) -> Float[Array, " L"]:
         """Slacks of the conditions linear in y: `E`, `G^-1 (I + E)`, `y - low`,
@@ -96,9 +97,11 @@ class AdmissibleMatrices(eqx.Module):
         They must be >= 0; 1 where there is no bound.
         """
         e = self.matrices(y)
-        identity = jnp.eye(e.shape[1], dtype=e.dtype)[None]
+        m = e.shape[1]
+        identity = jnp.eye(m, dtype=e.dtype)[None]
         impulses = self.inverse @ (identity + e)
-        slack = [self.origin + self.map @ y, impulses.reshape(-1)]
+        entries = self.origin + self.map @ y
+        slack = [entries, impulses.reshape(-1)]
         if self.bounds is not None:
             slack += [y - self.bounds[0], self.bounds[1] - y]
         slacks = jnp.concatenate(slack)
@@ -122,27 +125,31 @@ class AdmissibleMatrices(eqx.Module):
         m = self.closed.shape[1]
         q = self._dissipation(y)
         # (F, m) supports
-        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)
+        supports = list(product((0, 1), repeat=m))[1:]
+        faces = jnp.asarray(supports, q.dtype)
         # larger than all eigenvalues: contacts outside of the support do not take part
-        above = (m + 1.0) * (jnp.abs(q).max() + jnp.abs(self.inverse).max())
+        largest = jnp.abs(q).max() + jnp.abs(self.inverse).max()
+        above = (m + 1.0) * largest
         inside = faces[:, :, None] * faces[:, None, :]
-        outside = above * (1 - faces)[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
+        identity = jnp.eye(m, dtype=q.dtype)[None]
+        outside = above * (1 - faces)[:, :, None] * identity
         x = (
             jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])[1][..., 0]
             * faces[None]
         )
-        x = jnp.maximum(
-            x * jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)[..., None], 0.0
-        )
+        signs = jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)
+        x = jnp.maximum(x * signs[..., None], 0.0)
         x = x * self.closed[:, None, :]
-        norm = jnp.sqrt(jnp.sum(x**2, axis=-1, keepdims=True))
+        squares = jnp.sum(x**2, axis=-1, keepdims=True)
+        norm = jnp.sqrt(squares)
         x = x / jnp.where(norm > 0, norm, 1.0)
         return jax.lax.stop_gradient(x)
 
     def _dissipation(self, y: Float[Array, " Q"]) -> Float[Array, "S m m"]:
         """`G^-1 - E^T G^-1 E` of each scene."""
         e = self.matrices(y)
-        return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
+        gained = jnp.swapaxes(e, 1, 2) @ self.inverse @ e
+        return self.inverse - gained
 
     @full_precision
     def nearest(
@@ -161,9 +168,11 @@ class AdmissibleMatrices(eqx.Module):
         size = y.shape[0]
         dtype = y.dtype
         largest = jnp.max(jnp.diagonal(hessian))
-        weight = _LEAST_DAMPING[str(dtype)] * jnp.where(largest > 0, largest, 1.0)
+        positive = jnp.where(largest > 0, largest, 1.0)
+        weight = _LEAST_DAMPING[str(dtype)] * positive
         hessian = hessian + weight * jnp.eye(size, dtype=dtype)
-        rounding = _SHORT * jnp.finfo(dtype).eps * jnp.abs(self.inverse).max()
+        size_of_entries = jnp.abs(self.inverse).max()
+        rounding = _SHORT * jnp.finfo(dtype).eps * size_of_entries
         slack, rows = self.conditions(y)
         linear_count = len(slack) - self.faces  # those on the energy come last
         linear = slack[:linear_count], rows[:linear_count]
@@ -180,7 +189,8 @@ class AdmissibleMatrices(eqx.Module):
             energy, tangent = (x[linear_count:] for x in self.conditions(z))
             which = jnp.argsort(energy)[:worst]
             # the tangents at y
-            new = energy[which] + tangent[which] @ (y - z), tangent[which]
+            slack_at_y = energy[which] + tangent[which] @ (y - z)
+            new = slack_at_y, tangent[which]
             parts = zip(linear, (state.slacks, state.slopes), new)
             slacks, slopes = map(jnp.concatenate, parts)
             move, multipliers, solved = _quadratic(hessian, gradient, slacks, slopes)
@@ -188,18 +198,19 @@ class AdmissibleMatrices(eqx.Module):
             inside = (energy.min() >= -rounding) & (state.steps > 0)
             goes_on = solved & ~inside
             z = jnp.where(goes_on, y + move, z)
-            return _Cut(z, slacks[active], slopes[active], goes_on, state.steps + 1)
+            next_step = state.steps + 1
+            return _Cut(z, slacks[active], slopes[active], goes_on, next_step)
 
-        no_cuts = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
+        no_slack = jnp.ones(size, dtype)
+        no_cuts = no_slack, jnp.zeros((size, size), dtype)
         start = _Cut(y, *no_cuts, jnp.asarray(True), jnp.asarray(0))
         z = jax.lax.while_loop(
             lambda s: s.goes_on & (s.steps < _CUTS), add_cuts, start
         ).z
         # cutting planes leave rounding
         share = self.share(z)
-        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (
-            z - self.center
-        )
+        within = (1 - _SHORT * jnp.finfo(dtype).eps) * share
+        inside = self.center + within * (z - self.center)
         return jnp.where(share < 1, inside, z)
 
     def share(self, y: Float[Array, " Q"]) -> Float[Array, ""]:
@@ -212,7 +223,8 @@ class AdmissibleMatrices(eqx.Module):
         target = self.elementwise(y)
         # the others do not change along the ray
         crossed = (target < 0) & (target < slack)
-        share = quotient(slack, slack - target, where=crossed, otherwise=1.0).min()
+        shares = quotient(slack, slack - target, where=crossed, otherwise=1.0)
+        share = shares.min()
 
         def shortened(state: _Share) -> _Share:
             """The share at which the approaches that are worst at the last one gain no
@@ -220,7 +232,8 @@ class AdmissibleMatrices(eqx.Module):
             """
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center))
-            nearer = jnp.minimum(share, self._energy_share(y, x).min())
+            shares = self._energy_share(y, x)
+            nearer = jnp.minimum(share, shares.min())
             return nearer, nearer < share, passes + 1
 
         first = (share, jnp.asarray(True), jnp.asarray(0))
@@ -262,7 +275,8 @@ class AdmissibleMatrices(eqx.Module):
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
             """The slacks (C,) at y, to be differentiated, and again as they are."""
             lost = _square(self._dissipation(y), x)
-            value = jnp.concatenate([self.elementwise(y), lost.reshape(-1)])
+            energies = lost.reshape(-1)
+            value = jnp.concatenate([self.elementwise(y), energies])
             return value, value
 
         rows, slack = jax.jacfwd(slacks, has_aux=True)(y)
@@ -294,7 +308,8 @@ def _quadratic(
     response = jax.scipy.linalg.cho_solve(factor, rows.T)  # H^-1 A^T
     # positive semidefinite; the multipliers need not be unique, the step is
     dual = solve_lcp(rows @ response, slack + rows @ unconstrained, symmetric=False)
-    return unconstrained + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
+    solved = dual.code == CODE["ok"]
+    return unconstrained + response @ dual.z, dual.z * scale, solved
 
 
 def _square(a: Float[Array, "S m m"], x: Float[Array, "S F m"]) -> Float[Array, "S F"]:
@@ -335,7 +350,8 @@ def matrix_region(
     origin = np.where(owner < 0, variables.fixed, 0.0)
     start = variables.point(start)
     bounds = np.stack([variables.low, variables.high])
-    is_bounded = np.isfinite(bounds[:, np.any(moves != 0, axis=0)]).any()
+    moving = np.any(moves != 0, axis=0)
+    is_bounded = np.isfinite(bounds[:, moving]).any()
     dtype = variables.low.dtype
     region = _region(
         scenes, dtype, origin, moves, bounds if is_bounded else None, start
@@ -376,7 +392,8 @@ def admissible_start(scenes: list[Scene]) -> Float[np.ndarray, "m m"]:
     region = _region(
         scenes, scenes[0].mass.dtype, np.zeros(m * m), np.eye(m * m), None, half
     )
-    will_do = _host_conditions(region, half)[0].min() >= -_rounding(region)
+    slack, _ = _host_conditions(region, half)
+    will_do = slack.min() >= -_rounding(region)
     e = half if will_do else _inner_point(region, half)
     if e is None:
         raise ValueError(
@@ -405,9 +422,11 @@ def _region(
             f"admissible, but has {m}. RestitutionMatrix(matrix, admissible=False) is "
             f"fitted without that."
         )
-    distinct = np.unique([_inverse(scene) for scene in scenes], axis=0)
+    inverses = [_inverse(scene) for scene in scenes]
+    distinct = np.unique(inverses, axis=0)
     arrays: Any = (origin, mix, distinct[:, :m], distinct[:, m], bounds, center)
-    return AdmissibleMatrices(*jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays))
+    in_precision = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
+    return AdmissibleMatrices(*in_precision)
 
 
 def encloses(law: Law, contacts: int) -> bool:
@@ -426,15 +445,18 @@ def _inverse(scene: Scene) -> Float[np.ndarray, "rows m"]:
     Equation: `G_ij = W_ij / (s_i s_j)`, W the Delassus matrix, s the `kinetic_norm`.
     """
     w = decoupled(delassus_matrix(scene), scene.closed)
-    g = np.asarray(as_matrix(scaled(w, 1 / kinetic_norm(scene))))
+    normalized = scaled(w, 1 / kinetic_norm(scene))
+    g = np.asarray(as_matrix(normalized))
     smallest = np.linalg.eigvalsh(g)[0]
-    if smallest < _REDUNDANT * len(g) * np.finfo(g.dtype).eps:
+    rounding = _REDUNDANT * len(g) * np.finfo(g.dtype).eps
+    if smallest < rounding:
         raise ValueError(
             f"Argument `scene` must have no redundant contacts to keep a restitution "
             f"matrix admissible, but the smallest eigenvalue of G is {smallest:.3g}. "
             f"RestitutionMatrix(matrix, admissible=False) is fitted without that."
         )
-    return np.vstack([np.linalg.inv(g), np.asarray(scene.closed, g.dtype)])
+    closed = np.asarray(scene.closed, g.dtype)
+    return np.vstack([np.linalg.inv(g), closed])
 
 
 _conditions = quick_jit(AdmissibleMatrices.conditions)
@@ -444,7 +466,8 @@ def _host_conditions(
     region: AdmissibleMatrices, y: Any
 ) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, "C Q"]]:
     """`AdmissibleMatrices.conditions` on the host, in double precision."""
-    slack, rows = _conditions(region, jnp.asarray(y, region.center.dtype))
+    point = jnp.asarray(y, region.center.dtype)
+    slack, rows = _conditions(region, point)
     return np.asarray(slack, float), np.asarray(rows, float)
 
 
@@ -454,14 +477,14 @@ def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
     """
     entries = len(region.origin)
     impulses = entries * (1 + len(region.inverse))
-    return slice(entries), slice(entries, impulses), slice(-region.faces, None)
+    of_faces = slice(-region.faces, None)
+    return slice(entries), slice(entries, impulses), of_faces
 
 
 def _rounding(region: AdmissibleMatrices) -> float:
     """By how much rounding may break a condition."""
-    return _ROUNDING[str(region.center.dtype)] * float(
-        np.abs(np.asarray(region.inverse)).max()
-    )
+    largest = np.abs(np.asarray(region.inverse)).max()
+    return _ROUNDING[str(region.center.dtype)] * float(largest)
 
 
 def _inner_point(
@@ -476,7 +499,8 @@ def _inner_point(
     """
     from scipy.optimize import linprog  # late: slow to import
 
-    free = np.any(np.asarray(region.map) != 0, axis=0)
+    columns = np.asarray(region.map) != 0
+    free = np.any(columns, axis=0)
     box = [*((x - moves, x + moves) for x, moves in zip(start, free)), (None, 1.0)]
     # rows: A, 1 of t, right side
     y = start
@@ -485,10 +509,12 @@ def _inner_point(
     for _ in range(_CUTS):
         slack, rows = _host_conditions(region, y)
         moving = np.any(rows[:, free] != 0, axis=1)
-        if slack[moving].min() > max(0.5 * most, _rounding(region)):
+        allowed = max(0.5 * most, _rounding(region))
+        if slack[moving].min() > allowed:
             return y
         # t <= slack + rows (z - y) for the next point z
-        new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ y])[moving]
+        ones = np.ones(len(rows))
+        new = np.column_stack([-rows, ones, slack - rows @ y])[moving]
         planes = np.vstack([planes, new])
         cost = np.append(np.zeros(len(start)), -1.0)
         farthest = linprog(cost, A_ub=planes[:, :-1], b_ub=planes[:, -1], bounds=box)
@@ -508,5 +534,7 @@ def boundary(
     if region is None:
         return ()
     slack, rows = _host_conditions(region, y)
-    at = (slack < _rounding(region)) & np.any(rows != 0, axis=1)
-    return tuple(name for name, kind in zip(_FACES, _kinds(region)) if at[kind].any())
+    moves = np.any(rows != 0, axis=1)
+    at = (slack < _rounding(region)) & moves
+    kinds = zip(_FACES, _kinds(region))
+    return tuple(name for name, kind in kinds if at[kind].any())

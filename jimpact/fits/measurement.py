@@ -57,14 +57,8 @@ class Measurement:
     ) -> "Measurement":
         """The measurement of values of these weights; its `size` follows from them."""
         unit = np.asarray(float(unit) or 1.0)
-        return cls(
-            value,
-            weight,
-            unit,
-            np.asarray(unit * np.linalg.norm(weight)),
-            mixing,
-            sigma,
-        )
+        size = np.asarray(unit * np.linalg.norm(weight))
+        return cls(value, weight, unit, size, mixing, sigma)
 
     @property
     def is_measured(self) -> Bool[np.ndarray, "*value"]:
@@ -78,14 +72,16 @@ class Measurement:
         value.
         """
         bad = jnp.broadcast_to(prediction.bad, self.value.shape)
-        error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.value)
+        predicted = jnp.where(bad, 0.0, prediction.value)
+        error = predicted - jnp.where(bad, 0.0, self.value)
         error = jnp.where(bad, PENALTY * self.unit, error)
         return jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
 
     def residual(self, prediction: Prediction) -> Float[Array, " R"]:
         """`L error / sigma` of R values, with `error` as above."""
         error = self.error(prediction)
-        return _mixed(error * self.weight, self.mixing, jnp).reshape(-1)
+        weighed = error * self.weight
+        return _mixed(weighed, self.mixing, jnp).reshape(-1)
 
     def weighed(self, factor: Float[np.ndarray, "*value"]) -> "Measurement":
         """The measurement with residuals `factor` times as large; 0 leaves a value out.
@@ -117,7 +113,8 @@ class Measurement:
         measured = self.is_measured
         sigma, mixing = whitening(covariance, measured)
         # factors that a weight already has (shots left out) stay
-        old = np.where(measured, np.asarray(self.sigma, float), 1.0)
+        sigma_of_data = np.asarray(self.sigma, float)
+        old = np.where(measured, sigma_of_data, 1.0)
         weight = self.weight * old / sigma
         sigma = np.where(measured, sigma, np.nan)
         return Measurement.of(self.value, sigma, weight, self.unit, mixing)
@@ -142,7 +139,8 @@ class Measurement:
         NaN counts as 0. Further axes hold derivatives, or samples.
         """
         errors = np.asarray(np.nan_to_num(errors))
-        return np.asarray(_mixed(errors * self._weight_of(errors), self.mixing))
+        weighed = errors * self._weight_of(errors)
+        return np.asarray(_mixed(weighed, self.mixing))
 
     def errors_of(
         self, independent: Float[np.ndarray, "..."]
@@ -158,14 +156,16 @@ class Measurement:
         else:
             back = _inverse(np.asarray(self.mixing, float))
         errors = _mixed(independent, back)
-        return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
+        divisor = np.where(weight > 0, weight, 1.0)
+        return np.where(weight > 0, errors / divisor, np.nan)
 
     def _weight_of(self, errors: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """The weights, with axes of length 1 behind, as many axes as these errors
         have.
         """
         more = (1,) * (errors.ndim - self.value.ndim)
-        return np.asarray(self.weight, float).reshape((*self.value.shape, *more))
+        shape = (*self.value.shape, *more)
+        return np.asarray(self.weight, float).reshape(shape)
 
     def log_of_norm(self) -> float:
         """`sum log(sigma sqrt(2 pi)) - log det L`: minus the logarithm of the density
@@ -182,11 +182,11 @@ class Measurement:
                 size = measured.size
             else:
                 size = shape[1]
-            diagonal = np.diagonal(
-                self.mixing.reshape(-1, size, size), axis1=1, axis2=2
-            )
+            blocks = self.mixing.reshape(-1, size, size)
+            diagonal = np.diagonal(blocks, axis1=1, axis2=2)
             log_diagonal = np.log(diagonal.reshape(shape))
-        log_sigma = np.log(sigma[measured] * math.sqrt(2 * math.pi))
+        root = math.sqrt(2 * math.pi)
+        log_sigma = np.log(sigma[measured] * root)
         return float(np.sum(log_sigma - log_diagonal[measured]))
 
 
@@ -209,7 +209,8 @@ def _inverse(mixing: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     if mixing.ndim == 3:
         return np.linalg.inv(mixing)
     size = mixing.shape[0] * mixing.shape[1]
-    return np.linalg.inv(mixing.reshape(size, size)).reshape(mixing.shape)
+    square = mixing.reshape(size, size)
+    return np.linalg.inv(square).reshape(mixing.shape)
 
 
 def _without(
@@ -219,4 +220,5 @@ def _without(
     `L^-1 L^-T`.
     """
     factor = _inverse(mixing).reshape(used.size, used.size)
-    return whitening((factor @ factor.T).reshape(mixing.shape), used)[1]
+    covariance = (factor @ factor.T).reshape(mixing.shape)
+    return whitening(covariance, used)[1]

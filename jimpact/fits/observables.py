@@ -58,10 +58,14 @@ class Shots(eqx.Module):
         `UNUSABLE`.
         """
         law, scenes = placed(law, self.scenes)
-        out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
-        unusable = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
-        bad = jnp.any(out.status[:, None] == unusable[None, :], axis=1)
-        return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
+        impact_of_shot = jax.vmap(impact, in_axes=(None, 0, 0))
+        out = impact_of_shot(law, scenes, self.pre)
+        codes = [CODE[name] for name in UNUSABLE]
+        unusable = jnp.asarray(codes, out.status.dtype)
+        is_unusable = out.status[:, None] == unusable[None, :]
+        bad = jnp.any(is_unusable, axis=1)
+        velocity = out.velocity[:, : self.bodies]
+        return Prediction(velocity, bad[:, None], out.status)
 
 
 class Observed(eqx.Module):
@@ -77,7 +81,8 @@ class Observed(eqx.Module):
     def __call__(self, law: Law) -> Prediction:
         """The value of the function; NaN counts as meaningless."""
         value = jnp.asarray(self.function(law))
-        return Prediction(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
+        no_status = jnp.zeros(1, jnp.int32)
+        return Prediction(value, ~jnp.isfinite(value), no_status)
 
 
 def filled_count(count: int) -> int:
@@ -106,10 +111,12 @@ def tolerated(
     if not sign_tolerance(pre.dtype) < law.accuracy(shapes) < COARSE_RTOL:
         return law, ()
     normals = data.each(scene, lambda each: np.asarray(each.normals))
-    fastest = [np.abs(n.T @ v).max() for n, v in zip(normals, pre)]
+    rates = [n.T @ v for n, v in zip(normals, pre)]
+    fastest = [np.abs(rate).max() for rate in rates]
     noise = [np.sqrt(np.square(n.T) @ s**2).min() for n, s in zip(normals, sigma)]
     # a noise of NaN, where a value was not measured, allows nothing
-    if not all(PART_OF_NOISE * s >= COARSE_RTOL * v for s, v in zip(noise, fastest)):
+    both = zip(noise, fastest)
+    if not all(PART_OF_NOISE * s >= COARSE_RTOL * v for s, v in both):
         return law, ()
     line = (
         f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is "

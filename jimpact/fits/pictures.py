@@ -55,7 +55,8 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     shots, bodies = predicted.shape
     dodge = side_by_side(bodies)
     x = np.arange(shots)[:, None] + dodge[None, :]  # (shots, bodies)
-    size = float(np.clip(220 / (shots * bodies), 3, 8))
+    size_for_all = 220 / (shots * bodies)
+    size = float(np.clip(size_for_all, 3, 8))
     if data is None:
         speed = ""
     else:
@@ -83,10 +84,10 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
             style: dict[str, Any] = {"fmt": "o", "mfc": "none", "ms": size, "lw": 1}
             style["color"] = colour_of(i)
             top.errorbar(x[:, i], measured[:, i], bars, **style)
-            top.plot(
-                x[:, i], predicted[:, i], "_", color=colour_of(i), ms=2.2 * size, mew=2
-            )
-            bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
+            style_of_fit = {"color": colour_of(i), "ms": 2.2 * size, "mew": 2}
+            top.plot(x[:, i], predicted[:, i], "_", **style_of_fit)
+            off = (measured - predicted)[:, i]
+            bottom.errorbar(x[:, i], off, bars, **style)
         for j, other in enumerate((others or {}).values()):
             values = _in_rows(other.predicted)[:, members]
             top.plot(x[:, members], values, "x+*"[j % 3], color=GREY, ms=0.8 * size)
@@ -128,7 +129,8 @@ def contour(result: Contour, title: str = "") -> Figure:
     'e[1]'
     """
     figure, axes = new_figure(5.0, title)
-    d = np.where(np.isfinite(result.deviance), result.deviance, np.nan).T
+    finite = np.isfinite(result.deviance)
+    d = np.where(finite, result.deviance, np.nan).T
     limit = result.limit
     axes.contourf(result.x, result.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(result.x, result.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
@@ -138,9 +140,8 @@ def contour(result: Contour, title: str = "") -> Figure:
         if log:
             logarithmic(axes, which)
     axes.set(xlabel=result.names[0], ylabel=result.names[1])
-    axes.fill(
-        [], [], color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region"
-    )
+    label = f"{100 * result.level:g} % region"
+    axes.fill([], [], color=COLOURS[0], alpha=0.25, label=label)
     legend_below(figure, 2)
     return figure
 
@@ -159,7 +160,8 @@ def _error_bars(fit: Fit) -> np.ndarray | None:
     """
     shape = fit.predicted.shape
     if fit.problem.sigma is not None:
-        return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
+        sigma = np.asarray(fit.problem.sigma, float)
+        return _in_rows(np.broadcast_to(sigma, shape))
     if np.isfinite(fit.noise):
         return _in_rows(np.full(shape, fit.noise))
     return None
@@ -178,11 +180,11 @@ def _label_shots(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
         axes.set_xlabel("body")
         axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
         return
-    ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
+    stride = -(-len(labels) // _LABELLED)
+    ticks = range(0, len(labels), stride)
     longest = max(len(labels[k]) for k in ticks)
-    axes.set_xticks(
-        list(ticks), [labels[k] for k in ticks], rotation=90 if longest > 4 else 0
-    )
+    angle = 90 if longest > 4 else 0
+    axes.set_xticks(list(ticks), [labels[k] for k in ticks], rotation=angle)
     axes.set_xlabel("shot" if data is not None else "value")
     axes.set_xlim(-0.6, len(labels) - 0.4)
 

@@ -59,9 +59,12 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     figure, grid = new_panels(len(result), 2.8)
     for axes, each in zip(grid, result):
         # sqrt(deviance) is linear between computed points: a parabola is drawn as one
-        places = np.linspace(0, len(each.value) - 1, _PARTS * (len(each.value) - 1) + 1)
-        between = np.interp(places, range(len(each.value)), each.value)
-        root = np.interp(between, each.value, np.sqrt(each.deviance))
+        steps = len(each.value) - 1
+        places = np.linspace(0, steps, _PARTS * steps + 1)
+        index = range(len(each.value))
+        between = np.interp(places, index, each.value)
+        roots = np.sqrt(each.deviance)
+        root = np.interp(between, each.value, roots)
         axes.plot(between, root**2, color=COLOURS[0], lw=1)
         axes.plot(each.value, each.deviance, ".", color=COLOURS[0], ms=4)
         axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
@@ -101,7 +104,8 @@ def correlation(fit: Fit) -> Figure:
     2
     """
     count = len(fit.names)
-    figure, axes = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
+    width = np.clip(1.8 + 0.5 * count, 3.0, 7.2)
+    figure, axes = new_figure(float(width))
     finite: Any = np.ma.masked_invalid(fit.correlation)
     axes.grid(False)
     image = axes.imshow(finite, vmin=-1, vmax=1, cmap="RdBu_r")
@@ -158,12 +162,10 @@ def residuals(fit: Fit) -> Figure:
     else:
         values = ""
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
-    first.axline(
-        (float(measured[is_measured].mean()),) * 2, slope=1.0, color=GREY, lw=0.8
-    )
-    first.plot(
-        fit.predicted[is_measured], measured[is_measured], color=COLOURS[0], **style
-    )
+    mean = float(measured[is_measured].mean())
+    first.axline((mean,) * 2, slope=1.0, color=GREY, lw=0.8)
+    fitted = fit.predicted[is_measured]
+    first.plot(fitted, measured[is_measured], color=COLOURS[0], **style)
     first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
     over, label = _residual_axis(fit)
     second.axhline(0, color=GREY, lw=0.8)
@@ -172,7 +174,8 @@ def residuals(fit: Fit) -> Figure:
     second.set(xlabel=label, ylabel=f"residual [{unit}]")
     ordered = np.sort(scaled)
     # expected of normal noise
-    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
+    count = len(ordered)
+    normal = ndtri((np.arange(count) + 0.5) / count)
     third.plot(normal, ordered, color=COLOURS[0], **style)
     third.axline(
         (0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY
@@ -250,7 +253,8 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
             _draw_ellipses(axes, fit, j, i, values)
     for axes, i in zip(grid[-1], shown):
         axes.set_xlabel(fit.names[i])
-    for axes, name in zip(grid[:, 0], ["density", *(fit.names[i] for i in shown[1:])]):
+    densities = ["density", *(fit.names[i] for i in shown[1:])]
+    for axes, name in zip(grid[:, 0], densities):
         axes.set_ylabel(name)
     return figure
 
@@ -279,10 +283,12 @@ def _draw_density(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> No
     """
     z = np.linspace(-_WIDE, _WIDE, 121)
     error = fit.standard_error[i]
-    density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
+    normalization = error * np.sqrt(2 * np.pi)
+    density = np.exp(-0.5 * z**2) / normalization
     if values is not None:
         axes.hist(values[:, i], bins="auto", density=True, color=COLOURS[4], alpha=0.5)
-    axes.plot(fit.value[i] + error * z, density, color=COLOURS[0], lw=1.2)
+    x = fit.value[i] + error * z
+    axes.plot(x, density, color=COLOURS[0], lw=1.2)
     axes.set_yticks([])
 
 
@@ -298,7 +304,8 @@ def _draw_ellipses(
     """
     if values is not None:
         axes.plot(values[:, i], values[:, j], ".", ms=2, color=COLOURS[4], alpha=0.5)
-    factor = np.linalg.cholesky(fit.covariance[np.ix_([i, j], [i, j])])
+    block = fit.covariance[np.ix_([i, j], [i, j])]
+    factor = np.linalg.cholesky(block)
     angle = np.linspace(0, 2 * np.pi, 181)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     for share in _SHARES:

@@ -193,7 +193,8 @@ def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
         run = drawn
     else:
         run = jax.jit(drawn, compiler_options=known_options())
-    values, statistics = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
+    random_key = jax.random.PRNGKey(seed)
+    values, statistics = jax.tree.map(np.asarray, run(random_key))
     return values, statistics
 
 
@@ -214,9 +215,8 @@ class _Inner:
         """L (): how far the region reaches from its center in a direction (P,) of
         length 1.
         """
-        ahead = (
-            jnp.zeros_like(self.region.center).at[: self.count].set(_AFAR * direction)
-        )
+        at_center = jnp.zeros_like(self.region.center)
+        ahead = at_center.at[: self.count].set(_AFAR * direction)
         return _AFAR * self.region.share(self.region.center + ahead)
 
     def values(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -225,27 +225,32 @@ class _Inner:
         Equation: with r = |z|, m = L tanh(r / L): `det = dm/dr (m / r)^(P - 1)`,
         `dm/dr = 1 / cosh(r / L)^2`; the dependence of L on d does not change it.
         """
-        r = jnp.sqrt(jnp.sum(z**2) + jnp.finfo(z.dtype).tiny)
+        tiny = jnp.finfo(z.dtype).tiny
+        r = jnp.sqrt(jnp.sum(z**2) + tiny)
         reach = self.reach(z / r)
         move = reach * jnp.tanh(r / reach)
-        y = self.region.center.at[: self.count].add(move * z / r)
-        x = y[: self.count] * self.problem.variables.scale[: self.count]
+        displacement = move * z / r
+        y = self.region.center.at[: self.count].add(displacement)
+        scale = self.problem.variables.scale[: self.count]
+        x = y[: self.count] * scale
         # log(1 / cosh^2), in a form that does not overflow
-        slope = -2 * (jnp.logaddexp(r / reach, -r / reach) - jnp.log(2.0))
-        return x, slope + (self.count - 1) * jnp.log(move / r)
+        log_cosh = jnp.logaddexp(r / reach, -r / reach)
+        slope = -2 * (log_cosh - jnp.log(2.0))
+        of_directions = (self.count - 1) * jnp.log(move / r)
+        return x, slope + of_directions
 
     def free(self, start: np.ndarray) -> jax.Array:
         """z (P,) of values x: `|z| = L artanh(|y - y_0| / L)`, at most `1 - _INSIDE` of
         the way.
         """
-        move = (jnp.asarray(self.problem.variables.point(start)) - self.region.center)[
-            : self.count
-        ]
+        point = jnp.asarray(self.problem.variables.point(start))
+        move = (point - self.region.center)[: self.count]
         size = jnp.linalg.norm(move)
         if size == 0:
             return move
         reach = self.reach(move / size)
-        return reach * jnp.arctanh(jnp.minimum(size / reach, 1 - _INSIDE)) * move / size
+        share = jnp.minimum(size / reach, 1 - _INSIDE)
+        return reach * jnp.arctanh(share) * move / size
 
 
 def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
@@ -253,9 +258,8 @@ def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
     `domains`.
     """
     low, high = domains.T
-    width = np.where(
-        np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0)
-    )
+    unbounded = np.maximum(np.abs(start), 1.0)
+    width = np.where(np.isfinite(high - low), high - low, unbounded)
     return np.clip(start, low + _INSIDE * width, high - _INSIDE * width)
 
 
@@ -273,11 +277,11 @@ def _priors(
     for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
         chosen = chosen_priors.get(name, chosen_priors.get(field, of_fit.get(i)))
         low, high = problem.domains[i].tolist()
-        priors[name] = _prior(name, chosen, low, high, bool(parameters.log[i]), kinds)
+        log = bool(parameters.log[i])
+        priors[name] = _prior(name, chosen, low, high, log, kinds)
     for name in chosen_priors:
-        check_choice(
-            "priors", name, dict.fromkeys((*problem.names, *parameters.of_fields))
-        )
+        known = dict.fromkeys((*problem.names, *parameters.of_fields))
+        check_choice("priors", name, known)
     return priors
 
 
@@ -319,14 +323,16 @@ def _prior(
     if isinstance(chosen, Normal):
         mean_std = mean_and_std(name, chosen, low, high)
         ends = (end if np.isfinite(end) else None for end in (low, high))
-        return kinds.TruncatedNormal(*mean_std, **dict(zip(("low", "high"), ends)))
+        bounds = dict(zip(("low", "high"), ends))
+        return kinds.TruncatedNormal(*mean_std, **bounds)
     if not isinstance(chosen, kinds.Distribution) or chosen.shape() != ():
         raise ValueError(
             f"Argument `priors` must map `{name}` to a ji.Uniform, a ji.Normal or a "
             f"numpyro distribution of one number, but has {chosen!r}."
         )
     # what it can yield must lie in the domain: seen on a sample
-    drawn = np.asarray(chosen.sample(jax.random.PRNGKey(0), (1000,)))
+    key = jax.random.PRNGKey(0)
+    drawn = np.asarray(chosen.sample(key, (1000,)))
     if (drawn < low).any() or (drawn > high).any():
         raise ValueError(
             f"Argument `priors` must lie in [{low:g}, {high:g}] for `{name}`, but "

@@ -57,7 +57,8 @@ def joined_words(parts: Sequence[str]) -> str:
     ('a', 'a, b and c')
     """
     if len(parts) > 1:
-        return " and ".join([", ".join(parts[:-1]), parts[-1]])
+        first = ", ".join(parts[:-1])
+        return " and ".join([first, parts[-1]])
     return "".join(parts)
 
 
@@ -68,10 +69,12 @@ def _values_in_words(fit: "Fit") -> str:
     seen = fit.determined
     data = _data_name(fit)
     determined = np.flatnonzero(seen)
-    others = " and ".join(_full_name(fit, int(i)) for i in np.flatnonzero(~seen))
+    unseen = np.flatnonzero(~seen)
+    others = " and ".join(_full_name(fit, int(i)) for i in unseen)
     parts = [_with_error(fit, int(i)) for i in determined]
     if len(parts) > _PARAMETERS_NAMED:
-        worst = int(np.argmax(np.nan_to_num(fit.standard_error[determined])))
+        errors = fit.standard_error[determined]
+        worst = int(np.argmax(np.nan_to_num(errors)))
         parts = [
             f"{len(parts)} parameters are fitted, the least certain {parts[worst]}"
         ]
@@ -101,7 +104,8 @@ def _objection(fit: "Fit") -> str:
     if not fit.found("law_fails"):
         return ""
     if fit.experiments is None:
-        lost = ~np.isfinite(fit.predicted[np.isfinite(fit.problem.measured)])
+        measured = np.isfinite(fit.problem.measured)
+        lost = ~np.isfinite(fit.predicted[measured])
         return f"fails in {'all' if lost.all() else 'some'} of these data"
     failing = sum(STATUS[int(code)].failure for code in fit.status)
     if failing == len(fit.status):
@@ -198,7 +202,8 @@ def _headline(fit: "Fit") -> str:
     else:
         count = f"{values} of {measured.size}"
     one_unit = len(set(fit.experiments.units)) == 1
-    what = counted(size, *(("body", "bodies") if one_unit else ("coordinate",)))
+    words = ("body", "bodies") if one_unit else ("coordinate",)
+    what = counted(size, *words)
     seen = f"{count} {'velocity' if measured.size == 1 else 'velocities'} measured"
     return f"Fit of {law} to {counted(shots, 'shot')} of {what} ({seen}), {fit.method}"
 
@@ -229,9 +234,8 @@ def named_values(fit: "Fit", values: np.ndarray) -> str:
     """Names and values (P,) of the parameters, in brackets what the data do not
     determine.
     """
-    cells = zip(
-        fit.names, np.where(np.abs(values) <= _ZERO, 0.0, values), fit.determined
-    )
+    rounded = np.where(np.abs(values) <= _ZERO, 0.0, values)
+    cells = zip(fit.names, rounded, fit.determined)
     return ", ".join(
         f"{name} {marked(value, seen, '.4g')}" for name, value, seen in cells
     )
@@ -245,7 +249,8 @@ def _parameters(fit: "Fit") -> list[str]:
     heads = f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"
     lines = [heads + " (profile)" * bool(fit.profiles)]
     seen = fit.determined
-    for i, (name, pieces) in enumerate(zip(fit.names, fit.intervals())):
+    rows = zip(fit.names, fit.intervals())
+    for i, (name, pieces) in enumerate(rows):
         error = fit.standard_error[i]
         if np.isnan(error):
             error_text = "unknown"
@@ -255,12 +260,14 @@ def _parameters(fit: "Fit") -> list[str]:
             error_text = "undetermined"
         interval = "-"
         if np.isfinite(error) or fit.profiles:
-            interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
+            ends = (fit.bounds[0][i], fit.bounds[1][i])
+            interval = pieces_in_words(pieces, ends)
         if fit.at_bound[i]:
             note = "at its bound"
         else:
             note = ""
-        note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
+        of_value = note if seen[i] else UNSEEN
+        note = ", ".join(filter(None, [of_value, _prior(fit, i)]))
         value = marked(fit.value[i], seen[i], ".6g")
         cells = f"{name:{width}s} {value:>12s} {error_text:>12s}   {interval}   {note}"
         lines.append(cells.rstrip())
@@ -287,11 +294,11 @@ def _correlations(fit: "Fit") -> list[str]:
 
     A correlation of size 1 would be a combination that the data do not determine.
     """
-    pairs = itertools.combinations(np.flatnonzero(fit.determined).tolist(), 2)
+    determined = np.flatnonzero(fit.determined).tolist()
+    pairs = itertools.combinations(determined, 2)
     sizes = {pair: float(fit.correlation[pair]) for pair in pairs}
-    worst = sorted(
-        (x for x in sizes if abs(sizes[x]) >= _CORRELATED), key=lambda x: -abs(sizes[x])
-    )
+    large = (x for x in sizes if abs(sizes[x]) >= _CORRELATED)
+    worst = sorted(large, key=lambda x: -abs(sizes[x]))
     lines = [
         f"{fit.names[i]} and {fit.names[j]}: {sizes[i, j]:.3f}"
         for i, j in worst[:_CORRELATIONS_SHOWN]
@@ -324,9 +331,8 @@ def _quality(fit: "Fit") -> list[str]:
         lines.append(f"chi^2          {squares} (sigma given)")
         lines += _sigma_sources(fit)
         if fit.noise > 1 and fit.loss == "squares":
-            ratio = np.sqrt(
-                fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1)
-            )
+            freedom = max(fit.degrees_of_freedom, 1)
+            ratio = np.sqrt(fit.starts[0].sum_of_squares / freedom)
             every = np.isclose(fit.noise, ratio, rtol=1e-3)
             if every:
                 part = ""
@@ -454,8 +460,10 @@ def _shots(fit: "Fit") -> list[str]:
     shots, bodies = data.pre.shape
     before = np.asarray(data.pre, float)
     measured = np.asarray(data.post, float)
-    largest = np.abs(fit.predicted).max(axis=1, keepdims=True)
-    fitted = np.where(np.abs(fit.predicted) <= _ROUNDING * largest, 0.0, fit.predicted)
+    sizes = np.abs(fit.predicted)
+    largest = sizes.max(axis=1, keepdims=True)
+    is_rounding = np.abs(fit.predicted) <= _ROUNDING * largest
+    fitted = np.where(is_rounding, 0.0, fit.predicted)
     shown = max(1, _VELOCITIES_SHOWN // bodies)
     for k, i in np.ndindex(*before[:shown].shape):
         if i == 0:
@@ -591,9 +599,8 @@ def save_fit(fit: "Fit", path: str | Path) -> Path:
         "result": encoded(complete)["fields"],
     }
     path = Path(path)
-    path.write_text(
-        json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8"
-    )
+    text = json.dumps(record, allow_nan=False, indent=1)
+    path.write_text(text + "\n", encoding="utf-8")
     return path
 
 

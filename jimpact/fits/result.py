@@ -97,11 +97,8 @@ class Predicted(NamedTuple):
             notes = [f"... and {counted(more, 'more shot')}"]
         else:
             notes = []
-        return str(
-            Table(
-                columns, rows, notes=[*notes, "low to high: of a measurement."], keys=2
-            )
-        )
+        all_notes = [*notes, "low to high: of a measurement."]
+        return str(Table(columns, rows, notes=all_notes, keys=2))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -149,7 +146,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             points = PROFILE_STARTS
         else:
             points = 0
-        return profiles_of(self, range(len(self.names)), LEVEL, points, self.progress)
+        every = range(len(self.names))
+        return profiles_of(self, every, LEVEL, points, self.progress)
 
     @property
     def _needs_profiles(self) -> bool:
@@ -205,8 +203,10 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             self.at_bound,
             self.determined,
         )
-        rows = list(zip(self.names, *(column.tolist() for column in columns)))
-        return Table([Column(name) for name in ("parameter", *names)], rows)
+        lists = (column.tolist() for column in columns)
+        rows = list(zip(self.names, *lists))
+        heads = ("parameter", *names)
+        return Table([Column(name) for name in heads], rows)
 
     @property
     @in_own_precision
@@ -252,10 +252,10 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
         x = jnp.asarray(self.value, problem.precision)
         names = tied_names(problem.law, ties)
-        errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
-        return dict(
-            zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist()))
-        )
+        slope = jax.jacfwd(values)(x)
+        errors = self.errors_of(np.asarray(slope, float))
+        tied_values = np.asarray(values(x), float).tolist()
+        return dict(zip(names, zip(tied_values, errors.tolist())))
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
         """Standard errors (...) of functions of the parameters, by linear propagation.
@@ -272,7 +272,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         variance = np.einsum(
             "...p,pq,...q->...", determined_slope, covariance, determined_slope
         )
-        blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
+        of_unseen = np.abs(slope[..., ~seen])
+        blind = (of_unseen > 0).any(axis=-1)
         return np.where(blind, np.inf, np.sqrt(variance))
 
     @in_own_precision
@@ -320,9 +321,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
                 f"the bodies of the fit, but has shape {np.shape(data)}."
             )
         check_values("shots", data)
-        data = Experiments(
-            data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units
-        )
+        nothing = np.zeros_like(np.asarray(data, float))
+        data = Experiments(data, nothing, scenes=scenes, units=units)
         if isinstance(self.problem.law, LawInScene) and scene is not None:
             raise ValueError(
                 "Argument `scene` must be left out where parts of the scene were "
@@ -361,7 +361,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         values = [
             x.value for x in parameters_of(self.law).values() if x.domain.per_contact
         ]
-        counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
+        lists = (value for value in values if np.ndim(value) == 1)
+        counts = {np.shape(value)[0] for value in lists}
         if scene.size != size or counts - {scene.contacts}:
             if counts:
                 also = f" and {min(counts)} contacts, one for each value of the law"
@@ -385,11 +386,11 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             else:
                 stretch = self.noise
             return stretch * np.asarray(sigma, float)
-        weight = np.ma.masked_equal(
-            np.asarray(self.problem.measurement.weight, float), 0.0
-        )
+        weights = np.asarray(self.problem.measurement.weight, float)
+        weight = np.ma.masked_equal(weights, 0.0)
         # NaN: never measured
-        return self.noise * np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)
+        deviation = np.sqrt((1 / weight**2).mean(axis=0))
+        return self.noise * deviation.filled(np.nan)
 
     def __getitem__(self, name: str) -> FittedParameter:
         """The parameter of this name, as in `names`."""
@@ -397,9 +398,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         i = self.names.index(name)
         value = float(self.value[i])
         error = float(self.standard_error[i])
-        return FittedParameter(
-            value, error, self.intervals()[i], bool(self.determined[i])
-        )
+        determined = bool(self.determined[i])
+        return FittedParameter(value, error, self.intervals()[i], determined)
 
     def intervals(
         self, level: float = LEVEL
@@ -420,9 +420,8 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     def confidence_interval(self, level: float = LEVEL) -> np.ndarray:
         """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
-        return np.array(
-            [(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)]
-        )
+        intervals = self.intervals(level)
+        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in intervals])
 
     @property
     def shows_lack_of_fit(self) -> bool:

@@ -4,7 +4,7 @@ ends differ.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -92,9 +92,9 @@ def _huber(
     `psi = max(-h, min(u, h))`.
     """
     inside = np.abs(u) <= HUBER
-    return np.where(
-        inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))
-    ), inside.astype(float)
+    size = np.where(inside, 1.0, np.abs(u))
+    weight = np.where(inside, 1.0, HUBER / size)
+    return weight, inside.astype(float)
 
 
 def _student(
@@ -106,7 +106,8 @@ def _student(
     Equation: `psi = -d log(density) / du = (f + 1) u / (f + u^2)`.
     """
     below = STUDENT + u**2
-    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
+    slope = (STUDENT + 1) * (STUDENT - u**2) / below**2
+    return (STUDENT + 1) / below, slope
 
 
 LOSSES = {"huber": _huber, "student": _student}
@@ -305,12 +306,14 @@ def find_minima(
         return _rough_ends(problem, None, rng, solver, STARTS * 2 ** (turn + 1))
 
     ends = _rough_ends(problem, starts, rng, solver)
-    ends = _extended(ends, 0 if starts else TURNS - 1, len(problem.names), repeated)
+    rounds = 0 if starts else TURNS - 1
+    ends = _extended(ends, rounds, len(problem.names), repeated)
     best = _groups(problem, ends)[0][:1]
     fine = minimize([problem.least_squares()], ends.y[best], solver, what="minima")
     fine = fine._replace(steps=fine.steps + ends.steps[best])
     # in the place of the rough end
-    for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
+    leaves = zip(jax.tree.leaves(ends), jax.tree.leaves(fine))
+    for leaf, value in leaves:
         leaf[best] = value
     total = len(ends.y)
     solver.show(f"fit: {total} of {total} starts done", total, total)
@@ -391,7 +394,8 @@ def _extended(
         more = search(ends, k)
         if more is None:
             break
-        least = np.nanmin(ends.squares) * (1 - 1 / more.jacobian.shape[1])
+        falls_by_chance = 1 - 1 / more.jacobian.shape[1]
+        least = np.nanmin(ends.squares) * falls_by_chance
         if np.nanmin(more.squares) < least:
             idle = 0
         else:
@@ -417,12 +421,13 @@ def _box(problem: FitProblem) -> Float[np.ndarray, "2 P"]:
         for end in (problem.variables.low, problem.variables.high)
     )
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, start - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, start + reach), high)
+    unbounded_low = log | np.isinf(low)
+    low = np.where(unbounded_low, np.maximum(low, start - reach), low)
+    unbounded_high = log | np.isinf(high)
+    high = np.where(unbounded_high, np.minimum(high, start + reach), high)
     elastic = np.array(problem.parameters.of_fields) == "restitution"
-    low = np.where(
-        elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low
-    )
+    above = elastic & (high > START_RESTITUTION)
+    low = np.where(above, np.maximum(low, START_RESTITUTION), low)
     return np.stack([low, high])
 
 
@@ -436,8 +441,10 @@ def start_points(
     - 1 once for each variable, u uniform in [0, 1).
     """
     low, high = _box(problem)
-    slices = rng.permuted(np.tile(np.arange(starts), (len(low), 1)), axis=1).T
-    points = np.tile(problem.variables.point(problem.start), (starts, 1))
+    numbers = np.tile(np.arange(starts), (len(low), 1))
+    slices = rng.permuted(numbers, axis=1).T
+    first = problem.variables.point(problem.start)
+    points = np.tile(first, (starts, 1))
     points[1:, : len(low)] = (
         low + (high - low) * (slices + rng.random(slices.shape)) / starts
     )[1:]
@@ -455,13 +462,14 @@ def _first_points(
     """
     ratios = np.flatnonzero(problem.parameters.log)
     corners = 2 ** len(problem.parameters.log)  # of the box of parameters
-    points = start_points(
-        problem, min(max(SCANNED, SCANNED_A_CORNER * corners), MOST_SCANNED), rng
-    )
-    chosen = [points[:1], _lowest(problem, points[1:], count - 1)]
+    scanned = max(SCANNED, SCANNED_A_CORNER * corners)
+    points = start_points(problem, min(scanned, MOST_SCANNED), rng)
+    lowest = _lowest(problem, points[1:], count - 1)
+    chosen = [points[:1], lowest]
     for i in ratios if len(ratios) <= SCANS else ():
         line = np.tile(points[0], (SCANNED // 2, 1))
-        line[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), len(line))
+        reach = np.log(SCAN_FACTOR)
+        line[:, i] += np.linspace(-reach, reach, len(line))
         chosen.append(
             _lowest(
                 problem,
@@ -488,18 +496,19 @@ def _lowest(
     if isinstance(problem.observe, Shots) and hasattr(law, "max_steps"):
         steps = min(SCAN_STEPS * problem.observe.bodies, law.max_steps)
         law = replace(law, max_steps=steps)  # type: ignore[call-arg]
-    many = stacked([replace(problem, law=law).for_compiled()], len(points))
+    one = replace(problem, law=law).for_compiled()
+    many = stacked([one], len(points))
     squares = np.empty(len(points))
     for rows, part in in_parts(
         _squares, (many, points), SCAN_LANES, np.arange(len(points))
     ):
         squares[rows] = np.nan_to_num(part, nan=np.inf)
     width = np.ptp(points[:, :parameters], axis=0)  # distances are in units of it
-    apart = (points[:, None] - points)[..., :parameters] / np.where(
-        width > 0, width, 1.0
-    )
+    unit = np.where(width > 0, width, 1.0)
+    apart = (points[:, None] - points)[..., :parameters] / unit
     # indices (S, P + 1) of the neighbours of each point, without itself
-    nearest = np.argsort(np.sum(apart**2, axis=-1), axis=1)[:, 1 : parameters + 2]
+    squared_distance = np.sum(apart**2, axis=-1)
+    nearest = np.argsort(squared_distance, axis=1)[:, 1 : parameters + 2]
     lowest = np.flatnonzero(squares < squares[nearest].min(axis=1))
     return points[lowest[np.argsort(squares[lowest])][:count]]
 
@@ -525,23 +534,23 @@ def _near(
     measured = int(np.sum(problem.measurement.weight > 0))
     variance = max(np.nanmin(ends.squares) / measured, noise**2)
     distinct = [group[0] for group in _groups(problem, ends)]
-    best = [
-        i for i in distinct if ends.squares[i] <= ends.squares[distinct[0]] + variance
-    ]
+    as_good = ends.squares[distinct[0]] + variance
+    best = [i for i in distinct if ends.squares[i] <= as_good]
     # directions that the data do not determine are not searched
     least = RANK_TOLERANCE[problem.precision] ** 2
     jacobian = np.nan_to_num(ends.jacobian[best])
     curvature = np.swapaxes(jacobian, 1, 2) @ jacobian
     inverse = np.linalg.pinv(curvature, rcond=least, hermitian=True)
-    error = np.sqrt(variance * np.diagonal(inverse, axis1=1, axis2=2))
+    diagonal = np.diagonal(inverse, axis1=1, axis2=2)
+    error = np.sqrt(variance * diagonal)
     # by turns: the index in `best` of each point's centre
     centre = np.arange(count) % len(best)
-    spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
+    logs = (np.log(NEAR_SPREAD), np.log(FAR_SPREAD))
+    spread = np.exp(rng.uniform(*logs, (count, 1)))
     z = rng.normal(size=(count, len(error[0])))
     move = np.minimum(spread * error[centre], START_SCALES) * z
-    return np.clip(
-        ends.y[best][centre] + move, problem.variables.low, problem.variables.high
-    )
+    moved = ends.y[best][centre] + move
+    return np.clip(moved, problem.variables.low, problem.variables.high)
 
 
 def _groups(problem: FitProblem, ends: Ends) -> list[list[int]]:
@@ -557,15 +566,17 @@ def _groups(problem: FitProblem, ends: Ends) -> list[list[int]]:
     unit = SAME_COST / ends.jacobian.shape[1]
     exact = problem.exact_squares
     equal = squares <= least * (1 + unit) + exact
-    order = np.lexsort(
-        (np.arange(len(y)), ~ends.converged, np.where(equal, least, squares))
-    )
+    not_converged = ~ends.converged
+    of_equal = np.where(equal, least, squares)
+    order = np.lexsort((np.arange(len(y)), not_converged, of_equal))
     groups: list[list[int]] = []
     for i in order:
         for group in groups:
             first = group[0]
-            close = abs(squares[i] - squares[first]) <= unit * squares[first] + exact
-            if close and _same_values(problem, ends, first, y[i] - y[first]):
+            allowed = unit * squares[first] + exact
+            close = abs(squares[i] - squares[first]) <= allowed
+            apart = y[i] - y[first]
+            if close and _same_values(problem, ends, first, apart):
                 group.append(int(i))
                 break
         else:
@@ -591,7 +602,8 @@ def _same_values(
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
     determined = singular > RANK_TOLERANCE[problem.precision] * singular[0]
     noise = np.sqrt(ends.squares[first] / len(jacobian))
-    errors = np.where(determined, noise / np.where(determined, singular, 1.0), 0.0)
+    divisor = np.where(determined, singular, 1.0)
+    errors = np.where(determined, noise / divisor, 0.0)
     allowed = np.maximum(SAME_ERRORS * errors, SAME_VALUE)
     return bool((np.abs(directions @ apart) <= allowed).all())
 
@@ -608,15 +620,17 @@ def solved(
     Errors of v- are passed on to v+ by the derivatives `dv+/dv-` of each problem's best
     minimum.
     """
-    ends = minimize(
-        [problem.least_squares() for problem in problems], points, solver, stop
-    )
+    least_squares = [problem.least_squares() for problem in problems]
+    ends = minimize(least_squares, points, solver, stop)
     if ends.slopes is None:
         return problems, ends
     starts = len(points) // len(problems)
-    best = np.nanargmin(ends.squares.reshape(-1, starts), axis=1)
-    slopes = ends.slopes[np.arange(0, len(points), starts) + best]
-    return [p.with_errors_before(slope) for p, slope in zip(problems, slopes)], ends
+    by_problem = ends.squares.reshape(-1, starts)
+    best = np.nanargmin(by_problem, axis=1)
+    first = np.arange(0, len(points), starts)
+    slopes = ends.slopes[first + best]
+    pairs = zip(problems, slopes)
+    return [p.with_errors_before(slope) for p, slope in pairs], ends
 
 
 # ---------------------------------------------------------------------------- robust
@@ -634,41 +648,75 @@ def robust_minimum(
     `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981); the noise returned is
     `s |psi| / mean(psi')`, a noise times the root of the degrees of freedom.
     """
-    measured = ~np.isnan(problem.measured)
     for _ in range(LOSS_ROUNDS):
         problem = problem.with_errors_before(solution.slopes)
-        error = problem.measurement.independent(problem.measured - solution.predicted)
-        scale = 1.0
-        if problem.sigma is None:
-            median = float(np.median(np.abs(error[measured])))
-            scale = max(MEDIAN * median, np.finfo(float).tiny)
-        weight, slope = LOSSES[loss](error / scale)  # psi(u) / u, psi'(u)
-        factor = np.sqrt(weight)
+        residuals = _robust_residuals(problem, solution, loss)
         point = problem.variables.point(solution.value)
-        held = problem
-        if solution.pre is not None and solution.slopes is not None:
-            held = problem.held(solution.pre, solution.slopes)
-        weighed = held.weighed(factor)
-        solution = solution_of(
-            weighed, minimize([weighed.least_squares()], point[None], solver)
-        )
+        solution = _reweighted(problem, solution, np.sqrt(residuals.weight), solver)
         moved = np.abs(problem.variables.point(solution.value) - point).max()
-        if problem.before is not None:  # the true v- follow the parameters
-            there = solution_of(problem, outcome_at(problem, solution.value))
-            solution = replace(
-                solution,
-                predicted=there.predicted,
-                status=there.status,
-                slopes=there.slopes,
-                pre=there.pre,
-            )
         if moved <= SETTLED:
             break
     else:
         solution = replace(solution, converged=False)
     problem = problem.with_errors_before(solution.slopes)
-    psi = (weight * error / scale)[measured]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[measured].mean(), LEAST_SLOPE)
+    measured = ~np.isnan(problem.measured)
+    psi = (residuals.weight * residuals.error / residuals.scale)[measured]
+    slope = max(residuals.slope[measured].mean(), LEAST_SLOPE)
+    noise = residuals.scale * np.sqrt(np.sum(psi**2)) / slope
     # weighted as in the problem, without the factors of the loss
     starts = solution_of(problem, outcome_at(problem, solution.value)).starts
     return problem, replace(solution, starts=starts), float(noise)
+
+
+class _RobustResiduals(NamedTuple):
+    """Residuals r `error` (K, n) of variance 1, their scale s, and `psi(u) / u`
+    `weight`, `psi'(u)` `slope` (K, n) of a loss at u = r / s.
+    """
+
+    error: np.ndarray
+    scale: float
+    weight: np.ndarray
+    slope: np.ndarray
+
+
+def _robust_residuals(
+    problem: FitProblem, solution: Solution, loss: str
+) -> _RobustResiduals:
+    """Residuals at a solution, s = 1 or, of unknown sigma, `MEDIAN median|r|`, and what
+    the loss makes of them.
+    """
+    error = problem.measurement.independent(problem.measured - solution.predicted)
+    scale = 1.0
+    if problem.sigma is None:
+        size = np.abs(error[~np.isnan(problem.measured)])
+        median = float(np.median(size))
+        scale = max(MEDIAN * median, np.finfo(float).tiny)
+    weight, slope = LOSSES[loss](error / scale)
+    return _RobustResiduals(error, scale, weight, slope)
+
+
+def _reweighted(
+    problem: FitProblem, solution: Solution, factor: np.ndarray, solver: Solver
+) -> Solution:
+    """Least squares from a solution on, with residuals `factor` (K, n) times as large.
+
+    The true v- of the last solution are held meanwhile, if v- have errors; afterwards
+    they follow the parameters.
+    """
+    held = problem
+    if solution.pre is not None and solution.slopes is not None:
+        held = problem.held(solution.pre, solution.slopes)
+    weighed = held.weighed(factor)
+    point = problem.variables.point(solution.value)
+    ends = minimize([weighed.least_squares()], point[None], solver)
+    new = solution_of(weighed, ends)
+    if problem.before is None:
+        return new
+    there = solution_of(problem, outcome_at(problem, new.value))
+    return replace(
+        new,
+        predicted=there.predicted,
+        status=there.status,
+        slopes=there.slopes,
+        pre=there.pre,
+    )

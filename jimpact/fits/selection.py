@@ -62,9 +62,8 @@ class LawFit:
     def to_dict(self) -> dict[str, Any]:
         """The record of a law as JSON data."""
         names = ("parameters", "left_out_error", "aicc", "adequate", "verdict", "fit")
-        return as_data(
-            {"rms": self.fit.rms} | {name: getattr(self, name) for name in names}
-        )
+        record = {name: getattr(self, name) for name in names}
+        return as_data({"rms": self.fit.rms} | record)
 
 
 _COLUMNS = (
@@ -168,7 +167,8 @@ class LawFits(Tabular):
             )
             notes.append(f"With it {values}: {so}.")
         columns = (*_COLUMNS, Column("values"))
-        return str(Table(columns, rows, head=[self.verdict, ""], notes=notes))
+        table = Table(columns, rows, head=[self.verdict, ""], notes=notes)
+        return str(table)
 
 
 class NestedTest(NamedTuple):
@@ -208,7 +208,8 @@ class NestedTest(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """The test as JSON data."""
-        return as_data(self._asdict() | {"needed": self.needed, "words": str(self)})
+        words = {"needed": self.needed, "words": str(self)}
+        return as_data(self._asdict() | words)
 
 
 def nested_test(simple: Fit, full: Fit) -> NestedTest:
@@ -255,10 +256,13 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
             f"Argument `full` must have more parameters that the data see than "
             f"`simple`, but has {full.rank} and {simple.rank}."
         )
-    names = tuple(x for x in full.names if x not in simple.names) or full.names
-    gain = max(simple.starts[0].sum_of_squares - full.starts[0].sum_of_squares, 0.0)
+    added = tuple(x for x in full.names if x not in simple.names)
+    names = added or full.names
+    least = full.starts[0].sum_of_squares
+    gain = max(simple.starts[0].sum_of_squares - least, 0.0)
     if full.problem.sigma is not None and full.noise <= 1:
-        return NestedTest(gain, more, None, float(chdtrc(more, gain)), names)
+        chance = float(chdtrc(more, gain))
+        return NestedTest(gain, more, None, chance, names)
     return _f_test(gain, more, full, names)
 
 
@@ -276,7 +280,8 @@ def _f_test(
         return NestedTest(np.nan, more, freedom, 1.0, names)
     squares = max(full.starts[0].sum_of_squares, full.problem.exact_squares)
     ratio = gain / more / (squares / freedom)
-    return NestedTest(ratio, more, freedom, float(fdtrc(more, freedom, ratio)), names)
+    chance = float(fdtrc(more, freedom, ratio))
+    return NestedTest(ratio, more, freedom, chance, names)
 
 
 def fit_laws(
@@ -373,9 +378,8 @@ def fit_laws(
                 len(candidates),
                 len(candidates),
             )
-            test, of_speed = _speed_test(
-                fits[best], candidates[best], scene, data, options
-            )
+            simplest = candidates[best]
+            test, of_speed = _speed_test(fits[best], simplest, scene, data, options)
     return LawFits(entries, left_out, test, of_speed)
 
 
@@ -412,7 +416,8 @@ def _candidates(
     if isinstance(laws, Mapping):
         for name, law in laws.items():
             check_kind(f"laws[{name!r}]", law, Law)
-        return {name: (law, _default(law, more)) for name, law in laws.items()}, {}
+        with_free = {name: (law, _default(law, more)) for name, law in laws.items()}
+        return with_free, {}
     contacts = max(scene.contacts for scene in scenes)
     alike = len({scene.contacts for scene in scenes}) == 1
     values = {"restitution": RESTITUTION} | values
@@ -445,7 +450,8 @@ def _candidates(
         if name in wanted and name not in left_out
         for label, candidate in _variants(law, contacts, alike, more).items()
     }
-    return candidates, {name: why for name, why in left_out.items() if name in wanted}
+    reasons = {name: why for name, why in left_out.items() if name in wanted}
+    return candidates, reasons
 
 
 def _opens_and_closes(scene: Scene) -> bool:
@@ -460,9 +466,8 @@ def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
     it has.
     """
     available = free_parameters_of(law)
-    return dict.fromkeys(
-        (*default_free(law), *(name for name in more if name in available)), True
-    )
+    known = (name for name in more if name in available)
+    return dict.fromkeys((*default_free(law), *known), True)
 
 
 def _variants(
