@@ -196,18 +196,22 @@ def searched(frames: Frames, flight: Flight, settings: Settings) -> Search:
 def _agreed(
     frames: Frames, flight: Flight, settings: Settings, least: np.ndarray
 ) -> Search:
-    """Rounds of the search until they agree; frames are divided by `least` sigma (n,)
-    or more.
+    """Rounds of the search until they agree, or come back to what an earlier one used;
+    frames are divided by `least` sigma (n,) or more.
     """
     search = _divided(
         frames.with_sigma(np.maximum(frames.sigma, least)), flight, settings
     )
+    earlier: list[np.ndarray] = []
     for _ in range(ROUNDS):
         fitted = flight.fitted_to(search.frames, search.verdict.flights)
         if search.agrees_with(fitted, least):
             break
         flight = fitted
         sigma = np.maximum(search.verdict.errors.sigma, least)
+        if any(np.allclose(sigma, used, AGREEING, 0.0) for used in earlier):
+            break
+        earlier.append(search.frames.sigma)
         search = _divided(frames.with_sigma(sigma), flight, settings)
     return search
 
