@@ -191,6 +191,7 @@ def likely_errors(
     least = least_noise(frames.q)
     held = held_rather(frames, flights, flight)
     likely: dict[int, Likelihood] = {}
+    quick: list[tuple[Wave, ...]] = [()] * n
     mostly = np.zeros(n, bool)
     for c in range(n):
         some = Coordinate.of(frames, flights, flight, c)
@@ -204,14 +205,16 @@ def likely_errors(
             known = sigma[c]
         none = np.zeros(len(some.starts), bool)
         on_lines = Likelihood(some, known, least[c], WAVE_SPEED * speeds[c], none)
-        found = on_lines.most_likely(frames.step)
+        quick[c] = on_lines.quick_waves(frames.step)
+        found = on_lines.most_likely(frames.step, quick[c])
         curved = on_lines.curved(price_of_bend(len(some.t)))
         free = ~held[some.flights]
         if some.counts[curved & free].sum() > MOSTLY * some.counts[free].sum():
             curved = some.counts > 3  # what bends most, a table or drag, bends all
             mostly[c] = True
         if curved.any():
-            other = replace(on_lines, bent=curved).most_likely(frames.step)
+            on_parabolas = replace(on_lines, bent=curved)
+            other = on_parabolas.most_likely(frames.step, quick[c])
             price_of_curves = curved.sum() * price_of_bend(len(some.t))
             if other.evidence + price_of_curves < found.evidence:
                 found = other
@@ -226,7 +229,8 @@ def likely_errors(
         for c in map(int, np.flatnonzero(kind & ~bent.any(axis=0))):
             if c in likely:  # drag and spin bend all places, though one by little
                 curved = likely[c].some.counts > 3
-                found = replace(likely[c], bent=curved).most_likely(frames.step)
+                on_parabolas = replace(likely[c], bent=curved)
+                found = on_parabolas.most_likely(frames.step, quick[c])
                 bent[likely[c].some.flights, c] = curved
                 sigma[c] = found.sigma
                 waves[c] = found.waves

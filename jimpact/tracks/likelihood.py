@@ -272,16 +272,15 @@ class Likelihood:
         gain = residual_squares(grams, 2) - residual_squares(grams, 3)
         return all_bent.bent & (gain > price)
 
-    def most_likely(self, step: float) -> Likely:
+    def most_likely(self, step: float, quick: tuple[Wave, ...]) -> Likely:
         """The most likely errors, without waves that do not save their price. `step`:
         [s].
 
-        Of slow waves, quick ones, and slow ones beside quick ones those that cost
+        Of slow waves, `quick` ones, and slow ones beside quick ones those that cost
         least.
         """
         if not self.shows_waves(self.white().sigma):
             return self.at(())
-        quick = self._quick_waves(step)
         tried = {quick, self._slow_waves(step)}
         if quick:
             tried.add(self._slow_waves(step, quick) + quick)
@@ -316,12 +315,14 @@ class Likelihood:
             shortest = max(shortest, SLOWER * wave.time)
         return binned.best_waves(shortest, beside)
 
-    def _quick_waves(self, step: float) -> tuple[Wave, ...]:
+    def quick_waves(self, step: float) -> tuple[Wave, ...]:
         """The most likely waves in pieces of flights; none unless they pay.
 
         A parabola in each piece takes slow waves away. White errors are those from
         frame to frame.
         """
+        if self.some.counts.max() < 4 * min(BINS):
+            return ()  # in which waves are not shown
         pieces = self.some.in_pieces(PIECE, QUICK_FRAMES)
         bent = np.ones(len(pieces.starts), bool)
         sigma = self.noise()
