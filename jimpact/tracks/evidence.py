@@ -24,6 +24,7 @@ from jimpact.tracks.likelihood import (
     SHARES,
     Coordinate,
     Likelihood,
+    Likely,
     residual_squares,
 )
 from jimpact.tracks.waves import Errors, Wave
@@ -168,6 +169,88 @@ class FlightCosts:
 # of places
 
 
+class Explained(NamedTuple):
+    """What explains the residuals of one coordinate in its flights.
+
+    Fields: the most likely errors; `bent` (F,), where flights have an acceleration of
+    their own; that of all flights; `mostly`: most frames are in flights that bend.
+    """
+
+    errors: Likely
+    bent: np.ndarray
+    acceleration: float
+    mostly: bool
+
+
+@dataclass(frozen=True)
+class CoordinateTask:
+    """One coordinate in all flights, in which errors are looked for.
+
+    Fields: likelihood of errors on lines; its quick waves; the acceleration of the
+    lines; the step from frame to frame [s].
+    """
+
+    on_lines: Likelihood
+    quick: tuple[Wave, ...]
+    acceleration: float
+    step: float
+
+    @classmethod
+    def of(
+        cls,
+        frames: Frames,
+        some: Coordinate,
+        flight: Flight,
+        c: int,
+        known: float | None,
+        fastest: float,
+    ) -> "CoordinateTask":
+        """Coordinate c; `known`: its sigma; `fastest`: velocity of waves at most."""
+        acceleration = float(flight.acceleration[c])
+        if flight.unknown[c]:
+            some, acceleration = some.at_best(acceleration)
+        none = np.zeros(len(some.starts), bool)
+        least = float(least_noise(frames.q)[c])
+        on_lines = Likelihood(some, known, least, fastest, none)
+        quick = on_lines.quick_waves(frames.step)
+        return cls(on_lines, quick, acceleration, frames.step)
+
+    def likely(self, bent: np.ndarray) -> Likely:
+        """The most likely errors where these flights (F,) are parabolas, others
+        lines.
+        """
+        likelihood = replace(self.on_lines, bent=bent)
+        return likelihood.most_likely(self.step, self.quick)
+
+    def explained(self, held: np.ndarray) -> Explained:
+        """Lines, or parabolas in flights that bend, whichever cost less.
+
+        Where flights with MOSTLY of the frames bend, but for those that are `held`
+        (F,), all do: a table or drag bends all.
+        """
+        some = self.on_lines.some
+        of_each = price_of_bend(len(some.t))
+        curved = self.on_lines.curved(of_each)
+        free = ~held[some.flights]
+        in_curved = some.counts[curved & free].sum()
+        mostly = bool(in_curved > MOSTLY * some.counts[free].sum())
+        if mostly:
+            curved = self.that_can_bend
+        straight = self.likely(np.zeros_like(curved))
+        if curved.any():
+            bent = self.likely(curved)
+            price_of_all = curved.sum() * of_each
+            if bent.evidence + price_of_all < straight.evidence:
+                return Explained(bent, curved, self.acceleration, mostly)
+        none = np.zeros_like(curved)
+        return Explained(straight, none, self.acceleration, mostly)
+
+    @property
+    def that_can_bend(self) -> np.ndarray:
+        """True (F,) for flights with more frames than a parabola has values."""
+        return self.on_lines.some.counts > 3
+
+
 def likely_errors(
     frames: Frames,
     flights: Sequence[np.ndarray],
@@ -181,59 +264,42 @@ def likely_errors(
     And the model, and the coordinates (F, n) in which flights have accelerations of
     their own, where that costs less. Waves by restricted likelihood, as each flight has
     a line or a parabola; lines or parabolas by the likelihood; the prices are BIC's.
-    `speeds` (n,): of the flights.
+    Where most flights bend in one place, or angle, all bend in the others, too: drag
+    and spin bend all places, though one by little. `speeds` (n,): of the flights.
     """
     n = len(frames.sigma)
-    sigma = frames.sigma.copy()
-    waves: list[tuple[Wave, ...]] = [()] * n
-    bent = np.zeros((len(flights), n), bool)
-    acceleration = flight.acceleration.copy()
-    least = least_noise(frames.q)
     held = held_rather(frames, flights, flight)
-    likely: dict[int, Likelihood] = {}
-    quick: list[tuple[Wave, ...]] = [()] * n
-    mostly = np.zeros(n, bool)
+    tasks: dict[int, CoordinateTask] = {}
+    found: dict[int, Explained] = {}
     for c in range(n):
         some = Coordinate.of(frames, flights, flight, c)
         if len(some.t) <= 2 * len(some.starts):
             continue
-        if flight.unknown[c]:
-            some, acceleration[c] = some.at_best(acceleration[c])
-        if estimated:
-            known = None
-        else:
-            known = sigma[c]
-        none = np.zeros(len(some.starts), bool)
-        on_lines = Likelihood(some, known, least[c], WAVE_SPEED * speeds[c], none)
-        quick[c] = on_lines.quick_waves(frames.step)
-        found = on_lines.most_likely(frames.step, quick[c])
-        curved = on_lines.curved(price_of_bend(len(some.t)))
-        free = ~held[some.flights]
-        if some.counts[curved & free].sum() > MOSTLY * some.counts[free].sum():
-            curved = some.counts > 3  # what bends most, a table or drag, bends all
-            mostly[c] = True
-        if curved.any():
-            on_parabolas = replace(on_lines, bent=curved)
-            other = on_parabolas.most_likely(frames.step, quick[c])
-            price_of_curves = curved.sum() * price_of_bend(len(some.t))
-            if other.evidence + price_of_curves < found.evidence:
-                found = other
-                bent[some.flights, c] = curved
-        sigma[c] = found.sigma
-        waves[c] = found.waves
-        likely[c] = on_lines
+        known = None
+        if not estimated:
+            known = float(frames.sigma[c])
+        fastest = WAVE_SPEED * speeds[c]
+        tasks[c] = CoordinateTask.of(frames, some, flight, c, known, fastest)
+        found[c] = tasks[c].explained(held)
     angles = np.array(frames.angles or (False,) * n)
     for kind in (angles, ~angles):
-        if not (mostly & bent.any(axis=0))[kind].any():
+        alike = [c for c in found if kind[c]]
+        if not any(found[c].mostly and found[c].bent.any() for c in alike):
             continue
-        for c in map(int, np.flatnonzero(kind & ~bent.any(axis=0))):
-            if c in likely:  # drag and spin bend all places, though one by little
-                curved = likely[c].some.counts > 3
-                on_parabolas = replace(likely[c], bent=curved)
-                found = on_parabolas.most_likely(frames.step, quick[c])
-                bent[likely[c].some.flights, c] = curved
-                sigma[c] = found.sigma
-                waves[c] = found.waves
+        for c in alike:
+            if not found[c].bent.any():
+                curved = tasks[c].that_can_bend
+                errors = tasks[c].likely(curved)
+                found[c] = found[c]._replace(errors=errors, bent=curved)
+    sigma = frames.sigma.copy()
+    waves: list[tuple[Wave, ...]] = [()] * n
+    bent = np.zeros((len(flights), n), bool)
+    acceleration = flight.acceleration.copy()
+    for c, explained in found.items():
+        sigma[c] = explained.errors.sigma
+        waves[c] = explained.errors.waves
+        acceleration[c] = explained.acceleration
+        bent[tasks[c].on_lines.some.flights, c] = explained.bent
     model = flight.with_values(acceleration, flight.drag)
     return Errors(sigma, tuple(waves)), model, bent
 
