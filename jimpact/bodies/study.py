@@ -9,8 +9,8 @@ from jimpact.bodies.base import Body
 from jimpact.tools.checks import check_word
 from jimpact.tools.study_tables import check_keys
 
-# classes of bodies by name, which a study writes in any case
-BODIES = {name: getattr(bodies, name) for name in dir(bodies) if name in dir(ji)}
+# names of the bodies, which a study writes in any case
+BODIES = sorted(name for name in dir(bodies) if name in dir(ji))
 # Units of the bodies' arguments, which a study writes behind their names. Words and
 # directions have no unit here, nor have lists of points [m] or of mixed units
 # (`corners` of a Polygon, `planes`, `at`), which the classes document.
@@ -41,11 +41,12 @@ def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
     ('x [m]', 'y [m]', 'angle [rad]')
     """
     check_keys(where, table, tuple(table), required=("kind",))
-    names = {name.lower(): name for name in sorted(BODIES)}
+    names = {name.lower(): name for name in BODIES}
     kind = str(table["kind"]).lower()
     name = names.get(kind, table["kind"])
     check_word(f"`kind` in {where}", name, names.values())
-    parameters = inspect.signature(BODIES[name]).parameters
+    body = getattr(bodies, name)
+    parameters = inspect.signature(body).parameters
     # key of the table, with its unit -> argument of the class
     keys = {f"{key}_{_UNITS[key]}" if key in _UNITS else key: key for key in parameters}
     required = tuple(
@@ -60,4 +61,4 @@ def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
         if not isinstance(arguments[several], list):
             raise ValueError(f"[{within}] must be tables, each headed by [{within}].")
         arguments[several] = [body_of(within, part) for part in arguments[several]]
-    return BODIES[name](**arguments)
+    return body(**arguments)

@@ -23,7 +23,6 @@ import jimpact as ji
 from jimpact.cli import options
 from jimpact.cli.study import Study, impact_study, motion_study, read_study
 from jimpact.cli.study_file import NO_DATA, without_none
-from jimpact.cli.study_motion import MotionStudy
 from jimpact.core.law import with_parameter
 from jimpact.core.registry import registered_laws
 from jimpact.tools.progress import Steps, waiting, wrapped
@@ -192,7 +191,7 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
     }
     study = read_study(command.study, command.law)
     fits: dict[str, Fit] = {}
-    if isinstance(study, MotionStudy):
+    if not isinstance(study, Study):  # of a motion
         if command.method is not None or command.all_free:
             raise ValueError(
                 "--method, --law all, --all-free must be left out for a motion."

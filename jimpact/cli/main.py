@@ -212,14 +212,12 @@ def parse(arguments: list[str]) -> Any:
 
 def cache_folder(no_cache: bool) -> str | None:
     """The folder of compiled programs, ours and those that JAX keeps of itself; None:
-    none.
+    none, with `no_cache` or where `JIMPACT_CACHE` is empty.
 
     JAX is told before it is imported; a folder that the user has set for it stays. Ours
-    is in the folder `JIMPACT_CACHE` (empty: none), else in the user's cache folder.
+    is in the folder `JIMPACT_CACHE`, else in the user's cache folder.
     """
     root = os.environ.get("JIMPACT_CACHE")
-    if no_cache:
-        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     if no_cache or root == "":
         return None
     from jimpact.tools.checks import needed

@@ -49,8 +49,8 @@ class Command:
     """Print JSON instead of text."""
     csv: Flag = False
     """Print the table as CSV instead of text."""
-    # Compile anew. Else compiled programs are stored in the user's cache folder, or in
-    # the folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
+    # Compile anew, as with an empty environment variable JIMPACT_CACHE. Else compiled
+    # programs are stored in the folder that it names, or in the user's cache folder.
     no_cache: Flag = False
 
     @classmethod
@@ -65,8 +65,7 @@ class Command:
 
     def remains(self) -> str:
         """Sentence: the files that remain of an interrupted command."""
-        cached = os.environ.get("JAX_COMPILATION_CACHE_DIR") and not self.no_cache
-        if cached:
+        if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
             return "Only compiled programs are stored."
         return "No result is stored."
 

@@ -1,5 +1,7 @@
 """Studies of one impact: scene, law, what is free and the data; and `read_study` for
 any study.
+
+A study that is not fitted imports no fits, and one of an impact no motions.
 """
 
 from collections.abc import Callable, Mapping
@@ -8,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import jimpact as ji
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.bodies.study import body_of
 from jimpact.cli.study_file import (
@@ -20,19 +23,17 @@ from jimpact.cli.study_file import (
     read_tables,
     without_none,
 )
-from jimpact.cli.study_motion import MotionStudy, motion_study_of
 from jimpact.core.law import Law, free_parameters_of
 from jimpact.core.scene import Scene, chain
-from jimpact.fits.fitting import fit
 from jimpact.fits.parameters import OF_SPEED, default_free
-from jimpact.fits.problem import FitProblem, of_shots
-from jimpact.fits.report import Fit
-from jimpact.fits.search import Search
 from jimpact.shots.data import Experiments, read_experiments
 from jimpact.tools.checks import missing_room
 from jimpact.tools.study_tables import arguments_of, check_keys, check_kind
 
 if TYPE_CHECKING:
+    from jimpact.cli.study_motion import MotionStudy
+    from jimpact.fits.problem import FitProblem
+    from jimpact.fits.report import Fit
     from jimpact.tracks.track import Track
 
 # Rooms that hold the keys of their tables, `jimpact/ROOM/study.py`. One that is left
@@ -83,21 +84,22 @@ class Study:
     velocities: tuple[str, ...] = ()
     track: "Track | None" = None
 
-    def run(self, **options: Any) -> Fit:
+    def run(self, **options: Any) -> "Fit":
         """`fit` with the study's options, or with those that are passed and not
         None.
         """
+        from jimpact.fits.problem import of_shots
+
         problem = self._problem(of_shots)  # `fit` passes on errors of v-
-        return fit(
-            problem, **fit_arguments(self.options | without_none(options), Search())
-        )
+        chosen = self.options | without_none(options)
+        return ji.fit(problem, **fit_arguments(chosen, ji.Search()))
 
     @property
-    def problem(self) -> FitProblem:
+    def problem(self) -> "FitProblem":
         """The problem that `run` solves."""
-        return self._problem(FitProblem.from_shots)
+        return self._problem(ji.FitProblem.from_shots)
 
-    def _problem(self, of_shots: Callable[..., FitProblem]) -> FitProblem:
+    def _problem(self, of_shots: Callable[..., "FitProblem"]) -> "FitProblem":
         """The problem of the study's shots, made by `of_shots` (law, scene, shots,
         choice).
         """
@@ -107,7 +109,7 @@ class Study:
         return of_shots(self.law, self.scene, self.experiments, *choice)
 
 
-def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
+def read_study(path: str | Path, law: str | None = None) -> "Study | MotionStudy":
     """A study from its TOML file: of one impact, or with a table [system] of a motion.
 
     Args:
@@ -172,11 +174,11 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
     ('Three equal hard balls, one shot', "Newton's cradle, three balls")
     """
 
-    def build(tables: dict[str, Any], path: Path) -> Study | MotionStudy:
+    def build(tables: dict[str, Any], path: Path) -> "Study | MotionStudy":
         """The study of a motion if there is a table [motion], else of an impact."""
-        return (motion_study_of if "motion" in tables else _impact_study)(
-            tables, path, law
-        )
+        if "motion" in tables:
+            return _motion_study(tables, path, law)
+        return _impact_study(tables, path, law)
 
     return _read(path, "[law]", build)
 
@@ -186,11 +188,20 @@ def impact_study(path: str | Path, law: str | None = None) -> Study:
     return _read(path, "[scene]", lambda tables, path: _impact_study(tables, path, law))
 
 
-def motion_study(path: str | Path) -> MotionStudy:
+def motion_study(path: str | Path) -> "MotionStudy":
     """The study of a motion, see `read_study`; one of an impact is refused."""
     return _read(
-        path, "[system]", lambda tables, path: motion_study_of(tables, path, None)
+        path, "[system]", lambda tables, path: _motion_study(tables, path, None)
     )
+
+
+def _motion_study(
+    tables: Mapping[str, Any], path: Path, law_name: str | None
+) -> "MotionStudy":
+    """`motion_study_of`."""
+    from jimpact.cli.study_motion import motion_study_of
+
+    return motion_study_of(tables, path, law_name)
 
 
 def _read(

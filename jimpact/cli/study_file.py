@@ -9,20 +9,21 @@ import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene
-from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_A_SCENE, entry_of, free_parameters
 from jimpact.fits.parts_of_motion import OF_A_MOTION
-from jimpact.fits.search import Search
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import check_choice, check_word, suggestion
 from jimpact.tools.study_tables import check_keys, check_kind
+
+if TYPE_CHECKING:
+    from jimpact.fits.search import Search
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
 NO_DATA = (
@@ -182,6 +183,8 @@ def law_of(
     row = REGISTRY[name]
     values = {key: x for key, x in table.items() if key in row.arguments}
     if row.law is RestitutionMatrix and "matrix" not in values and scene is not None:
+        from jimpact.fits.matrices import admissible_start
+
         values["matrix"] = admissible_start([scene])
     options = dict(tables.get("fit", {}))
     check_keys("[fit]", options, FIT)
@@ -239,7 +242,7 @@ def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in options.items() if value is not None}
 
 
-def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
+def fit_arguments(options: Mapping[str, Any], search: "Search") -> dict[str, Any]:
     """Arguments of `fit` from the options of a study: `starts`, `profiles`, and
     `search`.
 

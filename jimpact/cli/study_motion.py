@@ -5,19 +5,20 @@ file.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jimpact.cli.study_file import check_tables, fit_arguments, law_of, without_none
 from jimpact.core.law import Law
-from jimpact.fits.fitting_motion import MOTION_SEARCH, fit_motion
 from jimpact.fits.parameters import default_free
-from jimpact.fits.report import Fit
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.study import run_of, system_of
 from jimpact.motion.system import System
 from jimpact.shots.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.tools.study_tables import check_keys, check_kind
+
+if TYPE_CHECKING:
+    from jimpact.fits.report import Fit
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,12 @@ class MotionStudy:
     priors: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
 
-    def fit(self, **options: Any) -> Fit:
+    def fit(self, **options: Any) -> "Fit":
         """`fit_motion` with the study's options, or with those that are passed and not
         None.
         """
+        from jimpact.fits.fitting_motion import MOTION_SEARCH, fit_motion
+
         if self.measured is None:
             raise ValueError(
                 "a study of a motion must have a [data] table to be fitted."

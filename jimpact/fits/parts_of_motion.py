@@ -3,7 +3,7 @@ gravity, floor.
 """
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -12,8 +12,10 @@ import numpy as np
 
 from jimpact.core.contact import Contact
 from jimpact.core.law import Impulses, Law, OptionalValues, forwards_to_law, parameter
-from jimpact.motion.record import Motion
-from jimpact.motion.system import System
+
+if TYPE_CHECKING:  # a fit of impacts imports no motion
+    from jimpact.motion.record import Motion
+    from jimpact.motion.system import System
 
 OF_A_MOTION = ("q0", "v0", "gravity", "floor")
 # Share of the weight by which the forces of a system at its start may differ from a
@@ -41,7 +43,7 @@ class LawInMotion(Law):
         """Impulses of the law."""
         return self.law.impulses(contact)
 
-    def in_system(self, system: System) -> System:
+    def in_system(self, system: "System") -> "System":
         """The system with the potential of this gravity in the place of its own."""
         if self.gravity is None:
             return system
@@ -49,7 +51,7 @@ class LawInMotion(Law):
         return eqx.tree_at(lambda s: s.potential, system, weight)
 
     def start(
-        self, system: System, q0: jax.Array, v0: jax.Array
+        self, system: "System", q0: jax.Array, v0: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Fitted start q0, v0, else the given one; heights in q0 are above the fitted
         floor.
@@ -62,7 +64,7 @@ class LawInMotion(Law):
             return q0, v0
         return q0 - jnp.broadcast_to(self.floor * _up(system), q0.shape), v0
 
-    def seen(self, motion: Motion, system: System) -> Motion:
+    def seen(self, motion: "Motion", system: "System") -> "Motion":
         """The motion with heights as they were measured: those above the floor, plus
         its height.
         """
@@ -73,7 +75,7 @@ class LawInMotion(Law):
         return eqx.tree_at(lambda m: (m.q, m.events.q), motion, raised)
 
 
-def _up(system: System) -> jax.Array:
+def _up(system: "System") -> jax.Array:
     """(n,) change of the coordinates q where all bodies are lifted by one metre."""
     directions = system.body.base_directions
     assert directions is not None  # `with_parts_of_motion` has seen to it
@@ -81,7 +83,7 @@ def _up(system: System) -> jax.Array:
 
 
 def with_parts_of_motion(
-    law: Law, system: System, q0: jax.Array, v0: jax.Array, free: Iterable[str]
+    law: Law, system: "System", q0: jax.Array, v0: jax.Array, free: Iterable[str]
 ) -> Law:
     """The law with the parts of the motion that `free` names; the law itself, if it
     names none.
@@ -122,7 +124,7 @@ def with_parts_of_motion(
     return LawInMotion(law, **{name: values[name] for name in wanted})
 
 
-def _acceleration(system: System, q: jax.Array) -> jax.Array:
+def _acceleration(system: "System", q: jax.Array) -> jax.Array:
     """The acceleration of gravity g () of a system, from its forces at q (n,) [m/s^2].
 
     Equation: `g = f^T w / w^T w`, f the gradient of its potential, w that of the weight

@@ -8,12 +8,12 @@ from jimpact.fits.pictures_of_inference import (
     residuals as residuals,
 )
 from jimpact.methods.pictures import (
-    advice as advice,
     stability_map as stability_map,
     stability_pairs as stability_pairs,
     validity_map as validity_map,
     work_precision as work_precision,
 )
+from jimpact.methods.pictures_of_advice import advice as advice
 from jimpact.methods.pictures_of_comparison import (
     comparison as comparison,
     energy_plane as energy_plane,

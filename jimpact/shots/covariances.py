@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import block_diag
 
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 
@@ -57,6 +56,8 @@ def as_covariance(
         before = np.arange(2 * n) < n
         _check_positive(block, f" in shot {k + 1}", exact=before, least=ROUNDING)
     if array.ndim == 2:
+        from scipy.linalg import block_diag  # late: slow to import
+
         exact = np.tile(np.arange(2 * n) < n, count)
         _check_positive(array, " of all shots", exact, least=-ROUNDING)
         if not (array - block_diag(*blocks)).any():
@@ -132,6 +133,8 @@ def joined_covariance(many: Sequence[Any]) -> np.ndarray:
     """
     if all(each.ndim == 3 for each in many):
         return np.concatenate(many)
+    from scipy.linalg import block_diag  # late: slow to import
+
     return block_diag(*(block_diag(*each) if each.ndim == 3 else each for each in many))
 
 

@@ -399,15 +399,19 @@ def _ground() -> str:
 
 
 class _Bytes(NamedTuple):
-    """A compiled program, and the structure of its results as a pickled example."""
+    """A compiled program, and what loads it: a pickled example of its results, and
+    whether it calls LAPACK.
+    """
 
     payload: bytes
-    skeleton: bytes
+    pickled: bytes
 
     def loaded(self, arrays: int) -> Program:
         """The program, a function of a list of so many arrays."""
-        _load_lapack()
-        results = jax.tree.structure(pickle.loads(self.skeleton))
+        example, calls_lapack = pickle.loads(self.pickled)
+        if calls_lapack:
+            _load_lapack()
+        results = jax.tree.structure(example)
         arguments = jax.tree.structure((([0] * arrays,), {}))
         load: Any = serialize_executable.deserialize_and_load
         program: Program = load(self.payload, arguments, results)
@@ -415,7 +419,7 @@ class _Bytes(NamedTuple):
 
     def digest(self, name: str) -> bytes:
         """What a file of this name begins with."""
-        return hashlib.sha256(name.encode() + self.payload + self.skeleton).digest()
+        return hashlib.sha256(name.encode() + self.payload + self.pickled).digest()
 
 
 def _serialized(compiled: Any) -> _Bytes | None:
@@ -423,17 +427,18 @@ def _serialized(compiled: Any) -> _Bytes | None:
     LAPACK.
     """
     try:
-        if not all(
-            call.startswith(LAPACK) for call in CALLS.findall(compiled.as_text())
-        ):
+        calls = CALLS.findall(compiled.as_text())
+        if not all(call.startswith(LAPACK) for call in calls):
             return None
         payload, _, results = serialize_executable.serialize(compiled)
-        skeleton = pickle.dumps(jax.tree.unflatten(results, range(results.num_leaves)))
-        is_same = jax.tree.structure(pickle.loads(skeleton)) == results
+        example = jax.tree.unflatten(results, range(results.num_leaves))
+        pickled = pickle.dumps((example, bool(calls)))
+        unpickled, _ = pickle.loads(pickled)
+        is_same = jax.tree.structure(unpickled) == results
     except Exception:  # results that hold functions, say
         return None
     if is_same:
-        return _Bytes(payload, skeleton)
+        return _Bytes(payload, pickled)
     return None
 
 
@@ -463,7 +468,7 @@ def _write(path: Path, kept: _Bytes) -> None:
     Nothing is written where it cannot be: a full disk, a folder that may only be read.
     """
     length = len(kept.payload).to_bytes(LENGTH, "big")
-    content = kept.digest(path.name) + length + kept.payload + kept.skeleton
+    content = kept.digest(path.name) + length + kept.payload + kept.pickled
     name = None
     try:
         handle, name = tempfile.mkstemp(dir=path.parent)
