@@ -27,6 +27,7 @@ from .law import (
     forward_only as forward_only,
     forwards_to_law as forwards_to_law,
     free_parameters_of as free_parameters_of,
+    open_tolerance as open_tolerance,
     options_of as options_of,
     parameters_of as parameters_of,
     value_of as value_of,

@@ -602,6 +602,29 @@ class Law(Declared):
         return stored
 
 
+def open_tolerance(law: Law, scene: Scene, velocity: jax.Array) -> float | None:
+    """The default tolerance of a law that takes the `rtol` of `impact` in its place;
+    None: it has a tolerance of its own, or none.
+    """
+    found: list[Any] = []  # filled while JAX traces `look`: nothing is computed
+
+    def look(velocity: jax.Array) -> jax.Array:
+        """Enter in `found` the law's accuracy, and if it is the contact's rtol where
+        one is set.
+        """
+        contact = law.contact(scene, velocity)
+        other = contact.integrated_to(jnp.ones((), velocity.dtype))
+        taken: Any = law.accuracy(other)
+        found[:] = [law.accuracy(contact), taken is other.rtol]
+        return velocity
+
+    jax.eval_shape(look, velocity)
+    default, takes_another = found
+    if eqx.is_array(default) or not takes_another:
+        return None
+    return default
+
+
 def forwards_to_law(around: type[AnyLaw]) -> type[AnyLaw]:
     """Class decorator of a law around another one, its field `law`.
 

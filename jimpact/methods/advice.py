@@ -11,8 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.contact import kinetic_angles
-from jimpact.core.impacts import impact
-from jimpact.core.law import Law, check_law, free_parameters_of, options_of
+from jimpact.core.law import (
+    Law,
+    check_law,
+    free_parameters_of,
+    open_tolerance,
+    options_of,
+)
 from jimpact.core.registry import ADVISED, registered_laws, simplest_first
 from jimpact.core.scene import (
     Scene,
@@ -106,10 +111,15 @@ class Situation(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A law to try, and the scene to try it on: contacts taken as closed or not."""
+    """A law to try, and the scene to try it on: contacts taken as closed or not.
+
+    `rtol` is the law's tolerance, None: it takes none. As a number that varies it
+    shares one compiled program with others.
+    """
 
     law: Law
     scene: Scene
+    rtol: float | None
 
     def varied(
         self, velocity: np.ndarray, stiffness: np.ndarray
@@ -118,15 +128,19 @@ class Trial(NamedTuple):
         batch.
 
         Stiffness (r, m) [N/m^eta] of a law that has one, else v- (1, n) [m/s]: one
-        impact.
+        impact; the tolerance (r,) of a law that takes one.
         """
         rows, contacts = stiffness.shape
-        if "stiffness" not in free_parameters_of(self.law):
-            lanes = max(1, LANES // contacts**2)
-            return {"velocity": velocity[None, :]}, lanes
-        return {"stiffness": stiffness}, CHUNK if contacts <= FEW_CONTACTS else min(
-            rows, CHUNK
-        )
+        if "stiffness" in free_parameters_of(self.law):
+            varied = {"stiffness": stiffness}
+            batch = CHUNK if contacts <= FEW_CONTACTS else min(rows, CHUNK)
+        else:
+            varied = {"velocity": velocity[None, :]}
+            batch = max(1, LANES // contacts**2)
+        if self.rtol is not None:
+            count = len(next(iter(varied.values())))
+            varied["rtol"] = np.full(count, self.rtol, velocity.dtype)
+        return varied, batch
 
     def run(self, velocity: np.ndarray, varied: dict[str, Any]) -> Outcomes:
         """Outcomes of impacts at v- (n,), one for each row of the arguments
@@ -298,9 +312,10 @@ def _simplest_law(
         chosen = suffice[0]
     else:
         chosen = name
-    if "rtol" in options_of(type(laws[chosen].law)):
+    options = options_of(type(laws[chosen].law))
+    if "rtol" in options and laws[chosen].rtol is not None:
         candidates[chosen] = _with_coarsest_rtol(
-            candidates[chosen], situation, reference, tolerance
+            candidates[chosen], laws[chosen], situation, k, reference, tolerance
         )
     gap_ratio = None
     if situation.gapped.any():
@@ -567,10 +582,11 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     bistiffness = Bistiffness(k, law.exponent, e)
     laws["compliant"] = Compliant(bistiffness, friction=mu, tangential_stiffness=kappa)
     ordered = {name: laws[name] for name in simplest_first()}
-    return {
-        name: Trial(law, situation.scene if gapped and law.uses_gaps else touching)
-        for name, law in ordered.items()
-    }
+    tried = {}
+    for name, each in ordered.items():
+        scene = situation.scene if gapped and each.uses_gaps else touching
+        tried[name] = Trial(each, scene, open_tolerance(each, scene, jnp.asarray(v)))
+    return tried
 
 
 # -------------------------------------------------------------------------- running the
@@ -656,27 +672,36 @@ def _candidate(
 
 
 def _with_coarsest_rtol(
-    candidate: Candidate, situation: Situation, reference: Outcomes, tolerance: float
+    candidate: Candidate,
+    trial: Trial,
+    situation: Situation,
+    stiffness: np.ndarray,
+    reference: Outcomes,
+    tolerance: float,
 ) -> Candidate:
     """The candidate with the coarsest rtol, a power of ten, that suffices for this
     tolerance.
 
-    It changes v+ by less than `tolerance / SMALL_PART` in the energy norm over that of
-    v-.
+    It changes v+ by at most `tolerance / SMALL_PART` in the energy norm over that of
+    v-, at the nominal one of the stiffnesses (r, m); the default rtol, if no coarser
+    one does.
     """
+    assert trial.rtol is not None
     power = math.floor(math.log10(tolerance / SMALL_PART))
-    rtol = min(10.0**power, COARSEST_RTOL)
-    finest = default_rtol("time", situation.velocity.dtype)
-    while True:
-        rtol = max(rtol, finest)
-        law: Any = replace(candidate.law, rtol=rtol)  # type: ignore[call-arg]
-        out = impact(law, candidate.scene, situation.velocity)
-        v = np.asarray(out.velocity)
-        change = float(situation.distance(v - candidate.velocity))
-        if rtol == finest or change <= tolerance / SMALL_PART:
-            error = float(situation.distance(v - reference.velocity[0]))
-            return replace(candidate, law=law, worst=max(candidate.worst, error))
-        rtol /= 10
+    coarsest = min(10.0**power, COARSEST_RTOL)
+    decades = max(0, math.ceil(math.log10(coarsest / trial.rtol)))
+    rtol = np.maximum(coarsest / 10.0 ** np.arange(decades + 1), trial.rtol)
+    varied, batch = trial.varied(situation.velocity, stiffness)
+    nominal = {name: np.repeat(x[:1], len(rtol), axis=0) for name, x in varied.items()}
+    nominal["rtol"] = rtol.astype(situation.velocity.dtype)
+    out = in_batches(partial(trial.run, situation.velocity), nominal, batch)
+    change = situation.distance(out.velocity - candidate.velocity)
+    suffices = change <= tolerance / SMALL_PART
+    suffices[-1] = True
+    i = int(np.argmax(suffices))
+    law: Any = replace(candidate.law, rtol=float(rtol[i]))  # type: ignore[call-arg]
+    error = float(situation.distance(out.velocity[i] - reference.velocity[0]))
+    return replace(candidate, law=law, worst=max(candidate.worst, error))
 
 
 def _with_simplest_laws(

@@ -13,7 +13,7 @@ import numpy as np
 from jimpact.core.impacts import Impact, impact
 from jimpact.core.law import Law, with_entries
 from jimpact.core.scene import Scene, dense_mass, with_gaps
-from jimpact.tools.compiling import precise_jit
+from jimpact.tools.compiling import quick_jit
 from jimpact.tools.status import CODE, STATUS
 from jimpact.tools.threads import in_parts
 
@@ -89,14 +89,15 @@ class Outcomes(NamedTuple):
         return self._replace(velocity=v, impulse=p, tangential=p_t)
 
 
-@precise_jit
+@quick_jit
 def varied_impacts(
     law: Law, scene: Scene, velocity: jax.Array, varied: dict[str, Any]
 ) -> Outcomes:
     """Outcomes (r,) of impacts at v- (n,) [m/s] with the arguments `varied`, a row
     each.
 
-    Names are `velocity` (r, n), `gaps` (r, m) [m], or parameters of the law (r, ...).
+    Names are `velocity` (r, n), `gaps` (r, m) [m], `rtol` (r,) of `impact`, or
+    parameters of the law (r, ...).
     """
 
     def one(values: dict[str, jax.Array]) -> Outcomes:
@@ -104,14 +105,17 @@ def varied_impacts(
         one_scene = scene
         one_law = law
         v = velocity
+        rtol = None
         for name, value in values.items():
             if name == "velocity":
                 v = value
             elif name == "gaps":
                 one_scene = with_gaps(scene, value)
+            elif name == "rtol":
+                rtol = value
             else:
                 one_law = with_entries(one_law, (name,), jnp.ravel(value))
-        return Outcomes.of(impact(one_law, one_scene, v))
+        return Outcomes.of(impact(one_law, one_scene, v, rtol=rtol))
 
     return jax.vmap(one)(varied)
 

@@ -9,13 +9,10 @@ number of samples it is in standard errors.
 """
 
 from dataclasses import replace
-from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jimpact.core.law import open_tolerance
 from jimpact.montecarlo.samples import Run
 from jimpact.montecarlo.statistics import AS_THE_LAW, FAILURE, Chunk, Tolerance
 
@@ -40,7 +37,8 @@ def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
     """
     if recorded is not None:
         return run(run.task(0, recorded))
-    default = open_tolerance(run)
+    with run.flags():
+        default = open_tolerance(*run.sample(0))
     task = run.task(0, AS_THE_LAW if default is None else Tolerance(default))
     fine = run.outcomes(task)
     # laws with a tolerance of their own, short runs and raw samples keep that of the
@@ -55,31 +53,6 @@ def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
             found = replace(coarser, tolerance=Tolerance(times * default, error))
             return run.reduced(found, coarse)
     return run.reduced(task, fine)
-
-
-def open_tolerance(run: Run) -> float | None:
-    """The default tolerance of a law that would take another one; None: it has its own,
-    or none.
-    """
-    law, scene, velocity = run.sample(0)
-    found: list[Any] = []  # filled while JAX traces `look`: nothing is computed
-
-    def look(velocity: jax.Array) -> jax.Array:
-        """Enter in `found` the law's accuracy, and if it is the contact's rtol where
-        one is set.
-        """
-        contact = law.contact(scene, velocity)
-        other = contact.integrated_to(jnp.ones((), velocity.dtype))
-        taken: Any = law.accuracy(other)
-        found[:] = [law.accuracy(contact), taken is other.rtol]
-        return velocity
-
-    with run.flags():
-        jax.eval_shape(look, velocity)
-    default, takes_another = found
-    if eqx.is_array(default) or not takes_another:
-        return None
-    return default
 
 
 def added_error(fine: Chunk, coarse: Chunk) -> float:

@@ -458,6 +458,19 @@ def test_unknown_ratio_decides(unknown):
     assert unknown.candidates["lzb"].worst >= effect.alone
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("tolerance", "rtol"), [(1e-2, 1e-3), (3e-3, 1e-4), (1e-5, 1e-6)]
+)
+def test_the_advised_rtol_moves_velocities_by_a_tenth_of_the_tolerance(tolerance, rtol):
+    """It is the coarsest power of ten below that tenth, and at most 1e-3."""
+    law = quick(BALLS, STRIKE, tolerance).law
+    assert law.rtol == rtol
+    exact = ji.impact(ji.LZB(1.0, rtol=1e-13), BALLS, STRIKE).velocity
+    moved = np.linalg.norm(ji.impact(law, BALLS, STRIKE).velocity - exact)
+    assert moved <= tolerance / 10 * np.linalg.norm(STRIKE)
+
+
 # known ratio, tolerance: law; at 1e3 the contacts act together, at 0.01 one after the other
 @pytest.mark.slow
 @pytest.mark.parametrize(

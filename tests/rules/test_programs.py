@@ -1,4 +1,4 @@
-"""How often ten calls are traced, how many programs they compile, and with which precision.
+"""How often eleven calls are traced, how many programs they compile, and with which precision.
 
 A process of its own makes each call, and makes it again with other numbers: then nothing is compiled
 anew. JAX writes down what it compiles, so that the count depends on no clock and on no other test.
@@ -24,11 +24,12 @@ CALLS = {
     "ball": (8, 10, 1),
     "block": (8, 8, 2),
     "compare": (26, 62, 2),
+    "advise": (26, 62, 6),
     "track": (1, 1, 0),
 }
 MORE = 1.5
-# traced again, not compiled: the function of a Monte Carlo run asks what its law looks like
-TRACED_AGAIN = {"monte carlo": 1}
+# traced again, not compiled: a Monte Carlo run and advice ask laws for their tolerance
+TRACED_AGAIN = {"monte carlo": 1, "advise": 6}
 
 SCRIPT = """
 import json
@@ -102,6 +103,7 @@ CALLS = {
     "ball": lambda e: fall(e, BALL, [1.0]),
     "block": lambda e: fall(e, BLOCK, [0.0, 0.4, 0.2]),
     "compare": lambda e: ji.compare(BALLS, STRIKE, {"a": ji.Newton(e), "b": ji.Poisson(e)}),
+    "advise": lambda e: ji.advise(BALLS, STRIKE, restitution=e, samples=8, timing=False),
     "track": track,
 }
 
