@@ -34,7 +34,7 @@ from jimpact.tools.checks import (
     check_values,
     in_common_dtype,
 )
-from jimpact.tools.compiling import full_precision
+from jimpact.tools.compiling import full_precision, known_options
 from jimpact.tools.progress import counting_bar
 from jimpact.tools.records import Column, Table, Tabular, fields_as_data, microseconds
 from jimpact.tools.status import STATUS
@@ -570,8 +570,8 @@ def _compiled(
     def compiled() -> Callable[..., Any]:
         """The compiled program of the arguments and a setting."""
         begin = time.perf_counter()
-        traced = jax.jit(function).lower(*arguments, jnp.ones((), float))
-        program = traced.compile()
+        quick = jax.jit(function, compiler_options=known_options())
+        program = quick.lower(*arguments, jnp.ones((), float)).compile()
         compile_time[name] = time.perf_counter() - begin
         return program
 

@@ -44,7 +44,7 @@ from jimpact.tools.checks import (
     check_kind,
     check_values,
 )
-from jimpact.tools.compiling import full_precision
+from jimpact.tools.compiling import full_precision, quick_jit
 from jimpact.tools.progress import counting_bar
 from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.tools.status import CODE
@@ -617,7 +617,7 @@ def runner(max_steps: int, setup: Setup, method: Contender, balls: int) -> Runne
         out, compared = solved(method, law, scene, v, setting)
         return compared, audit(out, scene, v).energy_gain
 
-    batch = jax.jit(jax.vmap(one))
+    batch = quick_jit(jax.vmap(one))
 
     def run(points: np.ndarray, settings: Any) -> tuple[Outcomes, np.ndarray]:
         """Outcomes and gains of energy at all points (L, 7), a batch at a time."""
