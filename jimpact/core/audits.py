@@ -22,7 +22,7 @@ from jimpact.core.scene import (
 )
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_kind, check_shape
-from jimpact.tools.compiling import full_precision
+from jimpact.tools.compiling import full_precision, quick_jit
 from jimpact.tools.records import formatted
 from jimpact.tools.status import STATUS, sign_tolerance
 
@@ -137,8 +137,7 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
     """A sentence for summaries if no contact approaches, so that no impact happens;
     else None.
     """
-    contact = contact_of(scene, as_velocity(scene, velocity), uses_gaps=True)
-    approaches = np.asarray(contact.gap_velocity < 0)
+    approaches = np.asarray(_approaching(scene, as_velocity(scene, velocity)))
     if (approaches & np.asarray(scene.closed)).any():
         return None
     if approaches.any():
@@ -150,6 +149,12 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
         "nothing approaches (gamma- < 0 at no contact): is the sign of the "
         "velocities as meant?"
     )
+
+
+@quick_jit
+def _approaching(scene: Scene, velocity: jax.Array) -> jax.Array:
+    """Mask (m,) of contacts that approach, beyond rounding."""
+    return contact_of(scene, velocity, uses_gaps=True).gap_velocity < 0
 
 
 @full_precision

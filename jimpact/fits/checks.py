@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag, coo_array
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.core.law import free_parameters_of, value_of
@@ -144,6 +143,8 @@ class Judged:
         """Orthonormal directions (R, C) of residuals that are momentum errors of shots;
         sparse.
         """
+        from scipy.sparse import block_diag, coo_array  # late: slow to import
+
         of_priors = np.zeros((len(self.problem.priors), 0))
         blocks_of_shots = _conserved(self.problem)
         blocks = [coo_array(block) for block in (*blocks_of_shots, of_priors)]

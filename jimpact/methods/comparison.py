@@ -17,6 +17,7 @@ from jimpact.core.scene import Scene, as_velocity, dense_mass
 from jimpact.methods.points import at_points, in_turns, left_out_notes, seconds
 from jimpact.theory.dispersion import dispersion_index, energy_ratio
 from jimpact.tools.checks import check_kind
+from jimpact.tools.compiling import quick_jit
 from jimpact.tools.records import (
     Column,
     Table,
@@ -153,9 +154,9 @@ class Comparison(Tabular):
             for name, x in self.entries.items()
         ]
         if self.measured is not None:
-            ratio = float(energy_ratio(self.scene, self.velocity, self.measured))
-            spread = float(dispersion_index(self.scene, self.measured))
-            rows.append(["measured", *self.measured.tolist(), ratio, spread, None, ""])
+            ratio, spread = _energies(self.scene, self.velocity, self.measured)
+            numbers = (*self.measured.tolist(), float(ratio), float(spread))
+            rows.append(["measured", *numbers, None, ""])
         notes = []
         if self.closest:
             rms = self.distances[self.closest[0]]
@@ -214,19 +215,29 @@ def compare(
     measured = in_turns(list(runs.values()), _REPEATS)
     each = dict(zip(runs, measured))
     times = {name: float(np.median(x)) for name, x in each.items()}
-    entries = {
-        name: Entry(
+    entries = {}
+    for name, run in runs.items():
+        outcome = run()
+        ratio, dispersion = _energies(scene, v, outcome.velocity)
+        entries[name] = Entry(
             law=laws[name],
-            outcome=(out := run()),
-            audit=audit(out, scene, v),
-            energy_ratio=float(energy_ratio(scene, v, out.velocity)),
-            dispersion_index=float(dispersion_index(scene, out.velocity)),
+            outcome=outcome,
+            audit=_audit(outcome, scene, v),
+            energy_ratio=float(ratio),
+            dispersion_index=float(dispersion),
             time=times[name],
             compile_time=max(first[name] - times[name], 0.0),
         )
-        for name, run in runs.items()
-    }
     return Comparison(scene, np.asarray(v), entries, left_out | raised)
+
+
+_audit = quick_jit(audit)
+
+
+@quick_jit
+def _energies(scene: Scene, before: Any, after: Any) -> tuple[jax.Array, jax.Array]:
+    """T+ / T- () and dispersion index () of v- and v+ (n,)."""
+    return energy_ratio(scene, before, after), dispersion_index(scene, after)
 
 
 def _first_call(law: Law, scene: Scene, velocity: jax.Array) -> float:

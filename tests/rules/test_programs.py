@@ -23,8 +23,8 @@ CALLS = {
     "monte carlo": (10, 9, 2),
     "ball": (8, 10, 1),
     "block": (8, 8, 2),
-    "compare": (26, 62, 2),
-    "advise": (26, 62, 6),
+    "compare": (4, 4, 4),
+    "advise": (32, 45, 6),
     "track": (1, 1, 0),
 }
 MORE = 1.5
