@@ -445,7 +445,9 @@ class FitProblem:
         """The law with parameters x (P,), and with the parts of the scene that are
         fitted.
         """
-        values = self.variables.entries(jnp.asarray(x, self.dtype))
+        if not isinstance(x, jax.Array):
+            x = np.asarray(x)
+        values = self.variables.entries(x.astype(self.dtype))
         law = with_entries(self.law, self.fields, values)
         if self.ties:
             return tied(law, self.ties)

@@ -108,9 +108,13 @@ class Variables:
         )
 
     @full_precision
-    def entries(self, x: Float[Array, " _"]) -> Float[Array, " Q"]:
-        """Entries of the fitted fields at x (P,), or (Q,) as `parameters` gives it."""
-        return jnp.where(self.owner >= 0, x[self.owner], self.fixed)
+    def entries(self, x: Float[AnyArray, " _"]) -> Float[AnyArray, " Q"]:
+        """Entries of the fitted fields at x (P,), or (Q,) as `parameters` gives it: on
+        the device, or on the host, where no operation is compiled.
+        """
+        if isinstance(x, jax.Array):
+            return jnp.where(self.owner >= 0, x[self.owner], self.fixed)
+        return np.where(self.owner >= 0, x[self.owner], self.fixed)
 
     def point(self, x: Float[np.ndarray, "*S P"]) -> Float[np.ndarray, "*S Q"]:
         """Variables y of values x, on the host: `x / scale`, or `log(x)`; zeros behind
