@@ -41,9 +41,9 @@ MOST_BODIES = 6
 ALTERNATING = 10.0
 
 # Share of the flights on both sides that flights within one contact last at most, and
-# of the jumps by which velocities turn back within these. Ten times more: any impacts
-# are one.
-WITHIN = 0.2
+# of the jumps by which velocities turn back within these; of bounces it is a half.
+# Three times more: any impacts are one.
+WITHIN = 0.3
 
 NO_IMPACT = "No impact was found"  # how its finding begins
 
