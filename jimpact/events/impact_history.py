@@ -73,9 +73,14 @@ class HistoryProgram:
         return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
-        """The results from the leaves of a problem; see the class."""
+        """The results from the leaves of a problem; see the class.
+
+        A first run finds the duration, without tangents: the times of the samples only
+        choose their steps. A second one keeps for each sample the step that contains
+        it, and the largest forces. Samples at the end are the state reached there.
+        """
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
-        flow, modes, y = self.outcome.flow(problem, 1.0)
+        flow, modes, y = self.outcome.flow(problem, with_slopes=False)
         gamma = problem.gamma
         max_passes = self.outcome.max_passes
         checkpoints = self.outcome.checkpoints
@@ -99,7 +104,7 @@ class HistoryProgram:
             )
 
         first = flow.contact_states(modes, y).force
-        clock = jnp.zeros((4, *y.shape[1:]), y.dtype)
+        clock = jnp.zeros((len(stepper.Clock), *y.shape[1:]), y.dtype)
         seen = Seen(
             self.one_per_sample(y),
             self.one_per_sample(modes),
