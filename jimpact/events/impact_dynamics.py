@@ -339,17 +339,18 @@ def undecided(problem: Problem) -> Bool[Array, "1 B"]:
 def begins_with_a_jump(problem: Problem) -> Bool[Array, "1 B"]:
     """Mask: forces jump as a contact closes, or opens, between two steps.
 
-    As it closes there is a force where it is F(0, x') > 0, as it opens where F(0, 0) >
-    0; the only contact is closed from the beginning. Steps of fixed length do not move
-    with the jump, nor do their slopes.
+    Its force jumps as a contact opens where F(0, 0) > 0, and as it closes where
+    F(0, x') > 0, here with gamma = -1. The only contact of an impact is closed from the
+    beginning. Steps of fixed length do not move with the jump, nor do their slopes.
     """
     gamma = problem.gamma
     if problem.viscous is None:
         return jnp.zeros_like(problem.tolerance, bool)
-    none = jnp.zeros_like(gamma)
-    jumps = problem.viscous.push(none, none) > 0
+    zero = jnp.zeros_like(gamma)
+    jumps = problem.viscous.push(zero, zero) > 0
     if len(gamma) > 1:
-        jumps = jumps | (problem.viscous.push(none, none - 1) > 0)
+        approach = jnp.full_like(gamma, -1.0)
+        jumps = jumps | (problem.viscous.push(zero, approach) > 0)
     return any_of(jumps)
 
 

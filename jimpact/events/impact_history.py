@@ -134,16 +134,16 @@ def _sampled(
     """Time, twice the energy and contact states of a sample, by one more step.
 
     `sample`: its time over the duration, then state, modes and clock of the step that
-    it lies in.
+    it lies in. That step goes `ahead` in the flow's own time. Indentations of open
+    contacts are 0.
     """
-    fraction, state, modes, clock = sample
-    # of time in the flow's own time
-    rate = flow.contact_states(modes, state).rate
-    since = fraction * time_of(end.reached) - time_of(state)
+    fraction, begin, modes, clock = sample
+    since = fraction * time_of(end.reached) - time_of(begin)
+    rate = flow.contact_states(modes, begin).rate
     ahead = quotient(since, rate, where=rate > 0)
     no_target = jnp.zeros(end.carry.step.target.shape, bool)
     step = stepper.Step(modes, no_target, clock)
-    state = stepper.between(flow, step, state, ahead)
+    state = stepper.between(flow, step, begin, ahead)
     contacts = flow.contact_states(modes, state)
     x = jnp.maximum(contacts.indentation, 0.0)
     energy = flow.energy(x, jnp.zeros_like(x))

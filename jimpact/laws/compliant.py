@@ -206,14 +206,14 @@ class Compliant(Law):
             )
             problem = problem._replace(tangential=tangential)
         return Dynamics(
-            problem,
-            units,
-            BISTIFFNESS,
-            exponent,
-            contact.structure,
-            self.max_steps,
-            method,
-            self.adjoint,
+            problem=problem,
+            units=units,
+            equations=BISTIFFNESS,
+            exponent=exponent,
+            structure=contact.structure,
+            max_steps=self.max_steps,
+            method=method,
+            adjoint=self.adjoint,
         )
 
     @full_precision

@@ -288,14 +288,14 @@ class LZB(Law):
             )
             problem = problem._replace(tangential=tangential)
         return Dynamics(
-            problem,
-            units,
-            BISTIFFNESS,
-            self.exponent,
-            contact.structure,
-            self.max_steps,
-            method,
-            self.adjoint,
+            problem=problem,
+            units=units,
+            equations=BISTIFFNESS,
+            exponent=self.exponent,
+            structure=contact.structure,
+            max_steps=self.max_steps,
+            method=method,
+            adjoint=self.adjoint,
         )
 
     @full_precision
