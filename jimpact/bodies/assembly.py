@@ -554,6 +554,16 @@ def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
                 )
 
 
+def _joins(pair: Any, count: int, moving: int) -> bool:
+    """True for the indices of two of `count` bodies, one of them of the first `moving`
+    ones, which move.
+    """
+    if np.shape(pair) != (2,) or not all(hasattr(i, "__index__") for i in pair):
+        return False
+    first, second = sorted(pair)
+    return 0 <= first < moving and first < second < count
+
+
 def _as_pairs(
     every: tuple[RigidBody, ...],
     shapes: Sequence[Shape],
@@ -561,29 +571,28 @@ def _as_pairs(
     d: int,
     pairs: Sequence[Any] | None,
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs (i, j) of bodies that have a gap function; raise a ValueError for others in
-    `pairs`.
+    """Pairs (i, j) of bodies that have a gap function: both have faces or are round.
+
+    Raise a ValueError for a pair that does not join two bodies one of which moves
+    (`_joins`), for one with another body, such as a dimer, and for two boxes in
+    space.
 
     Args:
         every: bodies, the first `moving` ones of which move, others are fixed.
         shapes: their shapes.
         moving: number of bodies that move.
         d: 2 or 3, in the plane or in space.
-        pairs: the argument of `Bodies`; None: all pairs one of which moves.
+        pairs: the argument of `Bodies`; None: all pairs one of which moves, of bodies
+            that have faces or are round; others are left out.
     """
     count = len(every)
+    has_gap = [bool(shape.faces) or shape.is_round for shape in shapes]
     if pairs is None:
-        ready = [i for i, shape in enumerate(shapes) if shape.faces or shape.is_round]
+        ready = [i for i in range(count) if has_gap[i]]
         ready_pairs = [(i, j) for i in ready for j in ready]
         pairs = [(i, j) for i, j in ready_pairs if i < j and i < moving]
     for pair in pairs:
-        if not (
-            np.shape(pair) == (2,)
-            and all(hasattr(i, "__index__") for i in pair)
-            and 0 <= min(pair) < moving
-            and max(pair) < count
-            and pair[0] != pair[1]
-        ):
+        if not _joins(pair, count, moving):
             if count > moving:
                 fixed = f", one of which moves (0 to {moving - 1})"
             else:
@@ -593,7 +602,7 @@ def _as_pairs(
                 f"{count - 1}{fixed}, but holds {pair!r}."
             )
         for i in pair:
-            if not (shapes[i].faces or shapes[i].is_round):
+            if not has_gap[i]:
                 raise ValueError(
                     f"Argument `pairs` must join discs, polygons, spheres and boxes, "
                     f"but body {i} is a {type(every[i]).__name__}."

@@ -209,7 +209,7 @@ class Disc(_PlanarBody):
         radius = positive("radius", radius)
         homogeneous = 0.5 * positive("mass", mass) * radius**2
         inertia = _given_inertia(inertia, homogeneous, centre)
-        shape, middle = _round_shape(radius, centre, 2, True)
+        shape, middle = _round_shape(radius, centre, 2, isotropic=True)
         self._make(middle[None], mass, inertia, shape, radius)
 
 

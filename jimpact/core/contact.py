@@ -639,12 +639,17 @@ def _by_size(groups: list[np.ndarray], m: int) -> Groups:
         cut = int(np.argmin(entries))
 
     def padded(part: list[np.ndarray]) -> np.ndarray:
-        """Groups (c, g), each padded to the length g of the last one, see `Groups`."""
+        """Groups (c, g), each padded to the length g of the last one.
+
+        The padding, m plus the first contact, is no index of a contact, and tells whose
+        scale of energy it has, see `Groups`.
+        """
         *_, longest = part
         rows = []
         for group in part:
             missing = len(longest) - len(group)
-            rows.append(np.pad(group, (0, missing), constant_values=m + group[0]))
+            padding = m + group[0]
+            rows.append(np.pad(group, (0, missing), constant_values=padding))
         return np.stack(rows)
 
     return tuple(padded(part) for part in (groups[:cut], groups[cut:]) if part)

@@ -224,7 +224,8 @@ class RandomLaw(eqx.Module):
                     f"Argument `{name}` must be Uniform or Normal, but is "
                     f"{distribution!r}."
                 )
-            distribution.check(name, known[name].value.size, False)
+            size = known[name].value.size
+            distribution.check(name, size, non_negative=False)
             _check_domain(name, distribution, known[name].domain)
         self.law = law
         self.parameters = parameters
@@ -237,15 +238,17 @@ class RandomLaw(eqx.Module):
         return f"{type(self.law).__name__}({words})"
 
     def __call__(self, key: jax.Array) -> Law:
-        """The law whose random parameters are drawn by this key, each by a key of its
-        own.
+        """The law whose random parameters are drawn by this key.
+
+        Each is drawn by a key of its own, in the order of their names: the draws do not
+        depend on the order of the arguments.
         """
         law = self.law
         known = free_parameters_of(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
             old, path, _ = known[name]
             own_key = jax.random.fold_in(key, i)
-            new = distribution.sample(own_key, old.size, old.dtype, False)
+            new = distribution.sample(own_key, old.size, old.dtype, non_negative=False)
             law = eqx.tree_at(operator.attrgetter(path), law, new.reshape(old.shape))
         return law
 

@@ -273,25 +273,28 @@ class Traced(NamedTuple):
     def _refusal(
         self, law: Law, scene: Scene, v: jax.Array, given: _Given
     ) -> jax.Array:
-        """`not_finite` or `out_of_range` where an argument is not allowed, else
-        `ok`.
+        """`not_finite` where a traced argument holds a NaN, `out_of_range` where one is
+        not allowed, infinite ones included, else `ok`.
         """
-        inputs = [x for x, traced in zip((law, scene, None, given), self) if traced]
-        numbers = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
-        unknown = [jnp.any(jnp.isnan(x)) for x in numbers]
+        traced: list[Any] = []
         allowed = [jnp.asarray(True)]
         if self.law:
+            traced.append(law)
             allowed.append(within_domains(law))
         if self.scene:
+            traced.append(scene)
             allowed.append(is_allowed(scene))
         if self.constrained:
             allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))
         if self.given:
-            numbers = [x for x in given if x is not None]
-            allowed += [(x >= 0) & (x < jnp.inf) for x in numbers]
+            traced.append(given)
+            some = [x for x in given if x is not None]
+            allowed += [(x >= 0) & (x < jnp.inf) for x in some]
         if self.given and given.rtol is not None:
             resolved = given.rtol >= precision(v.dtype).noise
             allowed.append(resolved & (given.rtol <= 1))
+        numbers = [x for x in jax.tree.leaves(traced) if eqx.is_inexact_array(x)]
+        unknown = [jnp.any(jnp.isnan(x)) for x in numbers]
         all_allowed = jnp.all(jnp.asarray(allowed))
         any_unknown = jnp.any(jnp.asarray(unknown, bool))
         code = jnp.where(all_allowed, CODE["ok"], CODE["out_of_range"])

@@ -240,7 +240,7 @@ def parameter(
         high_unless,
         searched_high,
     )
-    return _field(declared, default, kw_only, False)
+    return _field(declared, default, kw_only, static=False)
 
 
 def option(
@@ -280,7 +280,7 @@ def option(
     ValueError: Argument `method` must be one of auto, time, implicit, ...
     """
     declared = Option(choices, low, high, open_low, converter)
-    return _field(declared, default, kw_only, True)
+    return _field(declared, default, kw_only, static=True)
 
 
 def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool) -> Any:

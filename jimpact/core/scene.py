@@ -476,7 +476,7 @@ def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
     if scene.walls is None:
         # a multiple: few shapes, few programs
         size = -(-(n + missing) // contacts) * contacts
-        padded = _with_open_contacts(scene, contacts, size, False)
+        padded = _with_open_contacts(scene, contacts, size, dense_mass=False)
         return PaddedScene(padded, slice(n), slice(m), copied)
     mass: Any = np.asarray(scene.mass)
     gaps = _padded_gaps(scene, missing)

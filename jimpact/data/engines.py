@@ -24,11 +24,11 @@ class EngineScene(NamedTuple):
 # Ball 1 comes at 1 m/s, the others rest. Velocities that an engine was given are
 # divided by v1-.
 ENGINE_SCENES = {
-    "S1": EngineScene((1.0, 1.0, 1.0), False, 1.0),
-    "S2": EngineScene((1.0, 1.0, 1.0, 1.0, 1.0), False, 1.0),
-    "S3": EngineScene((1.0, 1.0, 1.0), False, 0.5),
-    "S4": EngineScene((1.0, 1.0), True, 1.0),
-    "S8": EngineScene((10.0, 1.0, 10.0), False, 1.0),
+    "S1": EngineScene((1.0, 1.0, 1.0), wall=False, restitution=1.0),
+    "S2": EngineScene((1.0, 1.0, 1.0, 1.0, 1.0), wall=False, restitution=1.0),
+    "S3": EngineScene((1.0, 1.0, 1.0), wall=False, restitution=0.5),
+    "S4": EngineScene((1.0, 1.0), wall=True, restitution=1.0),
+    "S8": EngineScene((10.0, 1.0, 10.0), wall=False, restitution=1.0),
 }
 
 

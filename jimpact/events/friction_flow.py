@@ -532,16 +532,47 @@ class FrictionFlow(ContactFlow):
     ) -> Float[Array, "n B"]:
         """The state in the limit of contacts that friction wedges: see `Cycle`.
 
-        With the impulses P and Q that are left `gamma + G P + K_nt Q = 0` of these
-        contacts, and `u + K_tn P + K_tt Q = 0` where slip stops, else
-        `Q = -mu P sign(u)`; P = Q = 0 of others. Where contacts are redundant, P and Q
-        are next to those of the series.
+        The impulses P and Q that are left solve `_wedged_equations`. Where contacts are
+        redundant, they are the solution with the least change from the impulses summed
+        over the cycles, `cycle.impulse` and `cycle.side`. Indentations x are 0 in the
+        limit.
         """
         m = self.contacts
         rows = self.friction_rows(y)
-        u = rows.u
         gamma = self.scales(modes) * rows.g
-        g_nn = self.coupling.dense(m)
+        matrix, right = self._wedged_equations(cycle, gamma, rows.u)
+        summed = jnp.concatenate([cycle.impulse, cycle.side])
+        error = right - times(matrix, summed)
+        soft = jnp.full_like(summed, ridge(summed.dtype))
+        correction = regularized(matrix, error, soft, refinements=1, without_null=True)
+        impulses = summed + correction
+        p = impulses[:m]
+        q = impulses[m:]
+        k_nt = self.normal_tangent
+        k_tn = jnp.swapaxes(k_nt, 0, 1)
+        gamma_change = times(self.coupling.dense(m), p) + times(k_nt, q)
+        dg = self.as_rows(modes, gamma_change)
+        limit = FrictionRows(
+            x=jnp.zeros_like(rows.x),
+            g=rows.g + dg,
+            p=rows.p + p,
+            u=rows.u + times(k_tn, p) + times(self.tangent, q),
+            side=rows.side + q,
+            time=rows.time,
+        )
+        return limit.packed()
+
+    def _wedged_equations(
+        self, cycle: Cycle, gamma: Float[Array, "m B"], u: Float[Array, "m B"]
+    ) -> tuple[Float[Array, "k k B"], Float[Array, "k B"]]:
+        """Matrix A and right side b of `A (P, Q) = b`, the impulses that friction
+        wedges.
+
+        Equation: `gamma + G P + K_nt Q = 0` of wedged contacts, P = 0 of others;
+        `u + K_tn P + K_tt Q = 0` where slip stops, `Q = -mu P sign(u)` of wedged ones
+        that slide, Q = 0 of others.
+        """
+        g_nn = self.coupling.dense(self.contacts)
         k_nt = self.normal_tangent
         k_tn = jnp.swapaxes(k_nt, 0, 1)
         k_tt = self.tangent
@@ -550,35 +581,16 @@ class FrictionFlow(ContactFlow):
         wedged = cycle.wedged[:, None]
         stops = cycle.stops[:, None]
         slides = jnp.where(wedged, -eye * drag[:, None], 0.0)
-        # rows of gamma = 0, else of P = 0
-        of_p = jnp.where(wedged, g_nn, eye)
-        of_q = jnp.where(wedged, k_nt, 0.0)
-        normal_rows = jnp.concatenate([of_p, of_q], axis=1)
-        # rows of u = 0, else of Q - drag P = 0, or Q = 0
-        of_p = jnp.where(stops, k_tn, slides)
-        of_q = jnp.where(stops, k_tt, eye)
-        tangential_rows = jnp.concatenate([of_p, of_q], axis=1)
-        matrix = jnp.concatenate([normal_rows, tangential_rows])
-        right_p = jnp.where(cycle.wedged, -gamma, 0.0)
-        right_q = jnp.where(cycle.stops, -u, 0.0)
-        impulses = jnp.concatenate([cycle.impulse, cycle.side])  # those of the series
-        error = jnp.concatenate([right_p, right_q]) - times(matrix, impulses)
-        soft = jnp.full_like(impulses, ridge(u.dtype))
-        nearest = regularized(matrix, error, soft, 1, without_null=True)
-        impulses = impulses + nearest
-        dp = impulses[:m]
-        dq = impulses[m:]
-        gamma_change = times(g_nn, dp) + times(k_nt, dq)
-        dg = self.as_rows(modes, gamma_change)
-        rows = FrictionRows(
-            x=jnp.zeros_like(rows.x),
-            g=rows.g + dg,
-            p=rows.p + dp,
-            u=u + times(k_tn, dp) + times(k_tt, dq),
-            side=rows.side + dq,
-            time=rows.time,
-        )
-        return rows.packed()
+        p_in_normal_rows = jnp.where(wedged, g_nn, eye)
+        q_in_normal_rows = jnp.where(wedged, k_nt, 0.0)
+        normal_rows = jnp.concatenate([p_in_normal_rows, q_in_normal_rows], axis=1)
+        p_in_side_rows = jnp.where(stops, k_tn, slides)
+        q_in_side_rows = jnp.where(stops, k_tt, eye)
+        side_rows = jnp.concatenate([p_in_side_rows, q_in_side_rows], axis=1)
+        normal_right = jnp.where(cycle.wedged, -gamma, 0.0)
+        side_right = jnp.where(cycle.stops, -u, 0.0)
+        matrix = jnp.concatenate([normal_rows, side_rows])
+        return matrix, jnp.concatenate([normal_right, side_right])
 
     def _after_one(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]

@@ -267,17 +267,24 @@ def flow_of(
     equations: ContactEquations,
     exponent: Exponent | None,
     structure: Structure,
-    tighten: float = 1.0,
+    with_slopes: bool,
 ) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
     """The flow of a problem with a batch in the last axis, its first modes and state.
 
     It is a `ContactFlow` without friction, a `SpringFlow` with tangential springs, else
-    a `FrictionFlow` in the plane, a `SlipFlow` in space. `tighten` < 1, a factor of the
-    tolerance: for a run with derivatives, which watches exponents that are an array.
+    a `FrictionFlow` in the plane, a `SlipFlow` in space. An exponent is `static` unless
+    the problem has it as an array.
+
+    `with_slopes`: the run has derivatives. Its tolerance is tighter, by
+    `GRADIENT_TIGHTENING`, and a `ContactFlow` whose exponents are an array `watches`
+    them.
     """
     m = problem.omega.shape[0]
     viscous = problem.viscous
-    with_slopes = tighten < 1
+    if with_slopes:
+        tolerance = GRADIENT_TIGHTENING * problem.tolerance
+    else:
+        tolerance = problem.tolerance
     static = None
     if problem.exponent is None:
         static = exponent
@@ -287,7 +294,7 @@ def flow_of(
         omega=problem.omega,
         restitution=problem.restitution,
         exponent_array=problem.exponent,
-        tolerance=tighten * problem.tolerance,
+        tolerance=tolerance,
         taking_part=problem.taking_part,
         viscous=viscous,
         exponent_static=static,
@@ -332,17 +339,18 @@ def undecided(problem: Problem) -> Bool[Array, "1 B"]:
 def begins_with_a_jump(problem: Problem) -> Bool[Array, "1 B"]:
     """Mask: forces jump as a contact closes, or opens, between two steps.
 
-    As it closes there is a force where it is F(0, x') > 0, as it opens where F(0, 0) >
-    0; the only contact is closed from the beginning. Steps of fixed length do not move
-    with the jump, nor do their slopes.
+    Its force jumps as a contact opens where F(0, 0) > 0, and as it closes where
+    F(0, x') > 0, here with gamma = -1. The only contact of an impact is closed from the
+    beginning. Steps of fixed length do not move with the jump, nor do their slopes.
     """
     gamma = problem.gamma
     if problem.viscous is None:
         return jnp.zeros_like(problem.tolerance, bool)
-    none = jnp.zeros_like(gamma)
-    jumps = problem.viscous.push(none, none) > 0
+    zero = jnp.zeros_like(gamma)
+    jumps = problem.viscous.push(zero, zero) > 0
     if len(gamma) > 1:
-        jumps = jumps | (problem.viscous.push(none, none - 1) > 0)
+        approach = jnp.full_like(gamma, -1.0)
+        jumps = jumps | (problem.viscous.push(zero, approach) > 0)
     return any_of(jumps)
 
 
@@ -382,11 +390,11 @@ class ImpulseProgram:
     queues: ClassVar[bool] = True
 
     def flow(
-        self, problem: Problem, tighten: float
+        self, problem: Problem, with_slopes: bool
     ) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
-        """The flow of a problem, its first modes and state."""
+        """The flow of a problem, its first modes and state; see `flow_of`."""
         compiled_in = self.equations, self.exponent, self.structure
-        flow, modes, y = flow_of(problem, *compiled_in, tighten)
+        flow, modes, y = flow_of(problem, *compiled_in, with_slopes)
         closed_form = flow.closed_form and not self.with_end_time
         return dataclasses.replace(flow, closed_form=closed_form), modes, y
 
@@ -406,12 +414,8 @@ class ImpulseProgram:
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
-        if self.finely:
-            tighten = GRADIENT_TIGHTENING
-        else:
-            tighten = 1.0
         flow, modes, y = pushforward(
-            lambda problem: self.flow(problem, tighten), problem
+            lambda problem: self.flow(problem, self.finely), problem
         )
         gamma = value_of(problem.gamma)
         if value_of(flow).at_once:

@@ -73,9 +73,14 @@ class HistoryProgram:
         return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
-        """The results from the leaves of a problem; see the class."""
+        """The results from the leaves of a problem; see the class.
+
+        A first run finds the duration, without tangents: the times of the samples only
+        choose their steps. A second one keeps for each sample the step that contains
+        it, and the largest forces. Samples at the end are the state reached there.
+        """
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
-        flow, modes, y = self.outcome.flow(problem, 1.0)
+        flow, modes, y = self.outcome.flow(problem, with_slopes=False)
         gamma = problem.gamma
         max_passes = self.outcome.max_passes
         checkpoints = self.outcome.checkpoints
@@ -99,7 +104,7 @@ class HistoryProgram:
             )
 
         first = flow.contact_states(modes, y).force
-        clock = jnp.zeros((4, *y.shape[1:]), y.dtype)
+        clock = jnp.zeros((len(stepper.Clock), *y.shape[1:]), y.dtype)
         seen = Seen(
             self.one_per_sample(y),
             self.one_per_sample(modes),
@@ -129,16 +134,16 @@ def _sampled(
     """Time, twice the energy and contact states of a sample, by one more step.
 
     `sample`: its time over the duration, then state, modes and clock of the step that
-    it lies in.
+    it lies in. That step goes `ahead` in the flow's own time. Indentations of open
+    contacts are 0.
     """
-    fraction, state, modes, clock = sample
-    # of time in the flow's own time
-    rate = flow.contact_states(modes, state).rate
-    since = fraction * time_of(end.reached) - time_of(state)
+    fraction, begin, modes, clock = sample
+    since = fraction * time_of(end.reached) - time_of(begin)
+    rate = flow.contact_states(modes, begin).rate
     ahead = quotient(since, rate, where=rate > 0)
     no_target = jnp.zeros(end.carry.step.target.shape, bool)
     step = stepper.Step(modes, no_target, clock)
-    state = stepper.between(flow, step, state, ahead)
+    state = stepper.between(flow, step, begin, ahead)
     contacts = flow.contact_states(modes, state)
     x = jnp.maximum(contacts.indentation, 0.0)
     energy = flow.energy(x, jnp.zeros_like(x))

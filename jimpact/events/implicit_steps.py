@@ -382,17 +382,18 @@ class ImplicitSteps:
     def guess(
         self, rate: Float[Array, "n B"], load: Float[Array, "m B"]
     ) -> Float[Array, "n B"]:
-        """Impulses (f, y): this load, and the parts of it that friction had in the last
-        step; 0 of a contact that was not pressed.
+        """Impulses (f, y): f is this load, `y = side / normal f` with the impulses
+        `normal` and `side` in `rate` of the last step; y = 0 of a contact that was not
+        pressed.
         """
         tangents = len(rate) // self.contacts - 1  # of a contact
         normal, side = self.parts(rate)
         pressed = normal > 0
-        of_pressed = jnp.where(pressed, normal, 1.0)
-        carried = jnp.repeat(of_pressed, tangents, axis=0)
+        divisor = jnp.where(pressed, normal, 1.0)
+        divisors = jnp.repeat(divisor, tangents, axis=0)
         load_of_pressed = jnp.where(pressed, load, 0.0)
         loads = jnp.repeat(load_of_pressed, tangents, axis=0)
-        return jnp.concatenate([load, side / carried * loads])
+        return jnp.concatenate([load, side / divisors * loads])
 
     def normal_impulses(
         self, s: ImplicitState, h: Float[Array, "1 B"], middle: Middle

@@ -123,7 +123,8 @@ def run(
     """The impact from gap velocities gamma to its end, in at most so many passes.
 
     Parts of `flow` and y that have tangents (see `tangents.py`) give a state with
-    tangents.
+    tangents. On a CPU at most `slots` impacts of the batch are advanced at once, fewer
+    with tangents, and others wait; with `observe` all are.
 
     Args:
         flow: the contacts, with the batch B of impacts in the last axis of its arrays.
@@ -145,10 +146,10 @@ def run(
         if observe is not None:
             new_seen = observe(now.seen, now.carry, accept)
             now = now._replace(seen=new_seen)
-        paused = carry.mark == Mark.PAUSED
         if not value_of(flow).self_similar:
             return now._replace(carry=carry)
-        rest = inspect(flow, gamma, carry, now.rest, paused, False)
+        paused = carry.mark == Mark.PAUSED
+        rest = inspect(flow, gamma, carry, now.rest, paused, at_end=False)
         settled = jnp.where(rest.ended, Mark.OVER, Mark.GOES_ON)
         return _OnItsWay(carry.marked(paused, settled), rest, now.seen)
 
@@ -197,5 +198,5 @@ def _finished(
 
     y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
     end = carry._replace(y=y)
-    rest_at_end = inspect(flow, gamma, end, rest, over, True)
+    rest_at_end = inspect(flow, gamma, end, rest, over, at_end=True)
     return ImpactEnd(end, carry.y, rest_at_end, seen)

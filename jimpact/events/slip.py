@@ -471,7 +471,12 @@ class SlipFlow(FrictionFlow):
     def contact_states(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
     ) -> ContactStates:
-        """Forces, velocities and slip in a state; u of loaded contacts is r d."""
+        """Forces, velocities and slip in a state; there are no springs, nor energy of
+        them.
+
+        Of loaded contacts the rows of slip stand for its speed r and direction d (see
+        `cartesian`), of open ones they are u itself.
+        """
         x, g, p = self.rows(y)
         const = self.constants(modes)
         loaded = self.loaded(modes)
@@ -487,8 +492,8 @@ class SlipFlow(FrictionFlow):
             tangential_force=motion.sliding + motion.holding,
             tangential_impulse=self.side_impulse(y),
             slip=flat(u),
-            tangential_energy=y[:0],
-            rate=const.frozen.unit / motion.haste,
+            tangential_energy=y[:0],  # no rows
+            rate=const.frozen.unit / motion.haste,  # as that of time in `field`
         )
 
     def field(

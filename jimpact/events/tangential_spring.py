@@ -259,14 +259,18 @@ class SpringFlow(FrictionFlow):
         f: Float[Array, "m B"],
         n: Float[Array, "m b B"],
     ) -> Float[Array, "t B"]:
-        """Tangential forces: holding `-kappa eta F / x xi`, sliding `-mu F n`."""
+        """Tangential forces of contacts with normal forces F (`f`), see above.
+
+        Holding: `-kappa eta F / x xi`, with kappa eta (`steep`), indentation x and
+        elongation xi of the spring; sliding: `-mu F n`, n its direction.
+        """
         x, *_ = self.rows(y)
         secant = quotient(f, x, where=x > 0)
         stiffness = (self.steep * secant)[:, None]
         held = -stiffness * self.spring(y)
         sliding = -(self.friction * f)[:, None] * n
-        side = jnp.where(const.slides[:, None], sliding, held)
-        return side.reshape(self.slip(y).shape)
+        tangential = jnp.where(const.slides[:, None], sliding, held)
+        return tangential.reshape(self.slip(y).shape)
 
     def slip_acceleration(
         self, f: Float[Array, "m B"], side: Float[Array, "t B"]

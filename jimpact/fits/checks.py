@@ -123,7 +123,9 @@ class Judged:
         `sqrt(chi^2 / degrees of freedom)`, else 1.
 
         The larger one of two: that of all residuals, and that of residuals without the
-        directions of conserved momentum, as errors of a law are in these only.
+        directions of conserved momentum, as errors of a law are in these only. The
+        second one is left out where a correction of the data has already taken these
+        directions away (`lost_freedom`), and where there are no shots.
         """
         squares = self.squares
         freedom = self.freedom
@@ -132,9 +134,9 @@ class Judged:
         if data is not None and not data.lost_freedom:
             momentum = self.momentum
             projections = momentum.T @ self.residual
-            squares -= float(np.sum(projections**2))
-            left = freedom - momentum.shape[1]
-            tests.append((max(squares, 0.0), left))
+            remaining = squares - float(np.sum(projections**2))
+            remaining_freedom = freedom - momentum.shape[1]
+            tests.append((max(remaining, 0.0), remaining_freedom))
         rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
         return float(np.sqrt(max(rejected, default=1.0)))
 

@@ -263,10 +263,9 @@ def wrong_unit(experiments: Experiments, scene: Scene | None) -> str:
     """The sentence of the finding `units`, by the data alone; '' where units seem
     right.
     """
-    return next(
-        (found.line for found in _units(DataBalances(experiments, scene, 0.0, True))),
-        "",
-    )
+    balances = DataBalances(experiments, scene, stored_energy=0.0, uses_gaps=True)
+    lines = (found.line for found in _units(balances))
+    return next(lines, "")
 
 
 def _units(data: DataBalances) -> Iterator[Finding]:

@@ -133,13 +133,12 @@ class AdmissibleMatrices(eqx.Module):
         inside = faces[:, :, None] * faces[:, None, :]
         identity = jnp.eye(m, dtype=q.dtype)[None]
         outside = above * (1 - faces)[:, :, None] * identity
-        x = (
-            jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])[1][..., 0]
-            * faces[None]
-        )
-        signs = jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)
-        x = jnp.maximum(x * signs[..., None], 0.0)
-        x = x * self.closed[:, None, :]
+        blocks = q[:, None] * inside[None] + outside[None]
+        _, vectors = jnp.linalg.eigh(blocks)
+        smallest = vectors[..., 0] * faces[None]
+        signs = jnp.where(jnp.sum(smallest, axis=-1) < 0, -1.0, 1.0)
+        positive = jnp.maximum(smallest * signs[..., None], 0.0)
+        x = positive * self.closed[:, None, :]
         squares = jnp.sum(x**2, axis=-1, keepdims=True)
         norm = jnp.sqrt(squares)
         x = x / jnp.where(norm > 0, norm, 1.0)

@@ -192,8 +192,10 @@ class Measurement:
 
 @full_precision
 def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
-    """`L e` of weighted errors e (K, n, ...), L = `mixing` of each shot or of all; e if
-    None.
+    """`L e` of weighted errors e (K, n, ...) by numpy or jax.numpy, `xp`.
+
+    L is `mixing`, (K, n, n) of each shot or (K, n, K, n) of all shots together; None:
+    the identity.
     """
     if mixing is None:
         return errors

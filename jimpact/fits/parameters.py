@@ -69,6 +69,10 @@ def entry_of(name: str) -> tuple[str, str | None]:
 def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
     """Indices (from 0) of a name's entries in the flattened field, which has this
     shape.
+
+    `field` names all of them, `field[2]` the second one, `field[1,2]` that of row 1 and
+    column 2, `field[1,2=2,1]` entries that are one parameter. Raise a ValueError for an
+    entry that the field does not have.
     """
     _, entry = entry_of(name)
     if entry is None:

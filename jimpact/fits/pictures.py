@@ -99,7 +99,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         _label_shots(bottom, fit, dodge)
     _draw_legend(figure, fit, others or {}, error is not None)
     for axes in figure.axes:
-        axes.grid(False, axis="x")
+        axes.grid(visible=False, axis="x")
     return figure
 
 

@@ -107,7 +107,7 @@ def correlation(fit: Fit) -> Figure:
     width = np.clip(1.8 + 0.5 * count, 3.0, 7.2)
     figure, axes = new_figure(float(width))
     finite: Any = np.ma.masked_invalid(fit.correlation)
-    axes.grid(False)
+    axes.grid(visible=False)
     image = axes.imshow(finite, vmin=-1, vmax=1, cmap="RdBu_r")
     axes.set_xticks(range(count), fit.names, rotation=90)
     axes.set_yticks(range(count), fit.names)

@@ -185,7 +185,8 @@ def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
     def drawn(key: jax.Array) -> tuple[Any, Any]:
         """Run the sampler with a random key: draws and fields."""
         sampler.run(key)
-        return sampler.get_samples(True), sampler.get_extra_fields(True)
+        draws = sampler.get_samples(group_by_chain=True)
+        return draws, sampler.get_extra_fields(group_by_chain=True)
 
     # as one program a short run takes half of the time (16 for 29 s); a progress bar
     # needs several

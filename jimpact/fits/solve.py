@@ -562,6 +562,10 @@ def _descended(
 ) -> tuple[SolverState, Bool[np.ndarray, " S"]]:
     """Last states of S solves within the box, and True for those that converged.
 
+    A solve ends where it converges or is stuck (`SolverState.done`), and after
+    `max_steps`; by Levenberg-Marquardt also where it creeps (`_creeps`) and, with
+    `noise`, where it is in the worse half (`_better_half`). At the deadline all end.
+
     Arguments as of `minimize`, but the problems are stacked.
     """
     dtype = points.dtype
@@ -577,14 +581,14 @@ def _descended(
     }
     advance = partial(advance_all, **rule)
     states = begin(problems, points, solver)
-    problems = replace(problems, zeros=None)
+    problems = replace(problems, zeros=None)  # only `begin` needs them
     converged = np.zeros(count, bool)
     # indices of the solves that go on
     active = np.arange(count)
     lanes = problems.lanes(count)
     compiles = True  # the first time
     while len(active):
-        before = states.cost.copy()
+        cost_before = states.cost.copy()
         trees = (problems, states)
         for rows, part in in_parts(
             advance, trees, lanes, active, solver.workers, compiles
@@ -595,10 +599,7 @@ def _descended(
         converged = _converged(states, DESCENDED if by_gradient else CONVERGED)
         ended = states.done | (states.steps >= solver.max_steps)
         if not by_gradient:
-            creeps = (states.cost > (1 - CREEPS) * before) & (
-                states.memory.value < _SHORT
-            )
-            ended |= creeps & ~converged
+            ended |= _creeps(states, cost_before) & ~converged
         active = active[~ended[active]]
         if noise is not None and not by_gradient:
             active = _better_half(states, active, noise / problems.size[0])
@@ -608,6 +609,17 @@ def _descended(
         if time.monotonic() > solver.deadline:
             break
     return states, converged
+
+
+def _creeps(
+    states: SolverState, cost_before: Float[AnyArray, " S"]
+) -> Bool[AnyArray, " S"]:
+    """True where Levenberg-Marquardt gains too little, see `CREEPS`, by steps that are
+    not short.
+    """
+    damping = states.memory.value
+    gains_little = states.cost > (1 - CREEPS) * cost_before
+    return gains_little & (damping < _SHORT)
 
 
 def _better_half(

@@ -253,9 +253,11 @@ def approaches(inputs: Inputs, now: CollisionState) -> jax.Array:
 
 
 def begin(inputs: Inputs) -> CollisionState:
-    """State before the first collision."""
+    """State before the first collision.
+
+    No collision has been slow so far, and no choice of the next one tied.
+    """
     dtype = inputs.qn.dtype
-    zero = jnp.array(0, jnp.int32)
     slip = None
     tangential = None
     if inputs.friction is not None:
@@ -264,8 +266,8 @@ def begin(inputs: Inputs) -> CollisionState:
     return CollisionState(
         qn=inputs.qn,
         p=jnp.zeros_like(inputs.qn),
-        number=zero,
-        place=zero,
+        number=jnp.array(0, jnp.int32),
+        place=jnp.array(0, jnp.int32),  # the first entry
         speed=jnp.array(jnp.inf, dtype),
         tied=jnp.array(False),
         gaps=inputs.gaps,

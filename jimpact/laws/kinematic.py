@@ -260,7 +260,7 @@ class RestitutionMatrix(Kinematic):
     matrix: Values = parameter(matrix=True)
     friction: OptionalValues = parameter(low=0.0)
     tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
-    admissible: bool = option(True, converter=bool)
+    admissible: bool = option(default=True, converter=bool)
 
     def __init__(
         self,

@@ -224,7 +224,7 @@ class LZB(Law):
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
     method: str = option("auto", METHODS)
-    check_conditioning: bool = option(False, (False, True))
+    check_conditioning: bool = option(default=False, choices=(False, True))
     adjoint: str = option("jacobian", ADJOINTS)
 
     def __check_init__(self) -> None:
@@ -288,14 +288,14 @@ class LZB(Law):
             )
             problem = problem._replace(tangential=tangential)
         return Dynamics(
-            problem,
-            units,
-            BISTIFFNESS,
-            self.exponent,
-            contact.structure,
-            self.max_steps,
-            method,
-            self.adjoint,
+            problem=problem,
+            units=units,
+            equations=BISTIFFNESS,
+            exponent=self.exponent,
+            structure=contact.structure,
+            max_steps=self.max_steps,
+            method=method,
+            adjoint=self.adjoint,
         )
 
     @full_precision

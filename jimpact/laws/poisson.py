@@ -65,7 +65,7 @@ class Poisson(Law):
     restitution: Values = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
     friction: OptionalValues = parameter(low=0.0)
     tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
-    allow_above_one: bool = option(False, converter=bool)
+    allow_above_one: bool = option(default=False, converter=bool)
 
     def __init__(
         self,
@@ -198,24 +198,27 @@ class _Expansion(NamedTuple):
 
 def _expands_otherwise(
     expansion: _Expansion,
-    compression: jax.Array,
+    impulse: jax.Array,
     velocity: jax.Array,
     shares: jax.Array,
 ) -> jax.Array:
     """True () where other `shares` (k, m + t) of the impulses of compression lead to
     another v+.
 
-    `velocity` (m + t,) is that to which the impulses of `compression` (m + t,) expand,
-    see `_Expansion.after`. Redundant contacts can share the impulse of compression in
-    several ways.
+    Redundant contacts can share the `impulse` (m + t,) of compression in several ways;
+    `velocity` (m + t,) is that to which it expands, see `_Expansion.after`. Shares that
+    return the same normal impulses e p_c expand alike: nothing is solved then. A share
+    after which expansion has no solution does not count.
     """
-    expansion, x, velocity, shares = jax.lax.stop_gradient(
-        (expansion, compression, velocity, shares)
+    expansion, impulse, velocity, shares = jax.lax.stop_gradient(
+        (expansion, impulse, velocity, shares)
     )
     m = len(expansion.friction)
-    root = precision(x.dtype).root
-    returned = expansion.restitution[None] * (shares - x[None])[:, :m]
-    needed = jnp.any(jnp.abs(returned) > root * jnp.abs(x).max())
+    root = precision(impulse.dtype).root
+    rounding = root * jnp.abs(expansion.b).max()
+    changes = (shares - impulse[None])[:, :m]
+    returned = expansion.restitution[None] * changes
+    returns_another = jnp.any(jnp.abs(returned) > root * jnp.abs(impulse).max())
 
     def any_differs() -> jax.Array:
         """True () where velocities differ for any of these shares."""
@@ -225,13 +228,21 @@ def _expands_otherwise(
             solution.
             """
             other, after = expansion.after(share)
-            apart = jnp.abs(after - velocity) > root * jnp.abs(expansion.b).max()
-            return jnp.any(apart) & (other.status < CODE["infeasible"])
+            apart = jnp.abs(after - velocity) > rounding
+            return jnp.any(apart) & _has_solution(other)
 
         return jnp.any(jax.lax.map(differs, shares))
 
-    no = jnp.zeros_like(needed)
-    return needed & cond(any_lane(needed), any_differs, lambda: no)
+    no = jnp.zeros_like(returns_another)
+    differ = cond(any_lane(returns_another), any_differs, lambda: no)
+    return returns_another & differ
+
+
+def _has_solution(impulses: FrictionImpulses) -> jax.Array:
+    """True () unless their friction problem has no solution: its status is `infeasible`
+    then, or graver.
+    """
+    return impulses.status < CODE["infeasible"]
 
 
 def _free_columns(w: jax.Array, loaded: jax.Array) -> jax.Array:

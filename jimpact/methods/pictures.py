@@ -327,7 +327,7 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
     axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
     axes.tick_params(which="both", length=0)
-    axes.grid(False)
+    axes.grid(visible=False)
     axes.grid(which="minor", color="white", lw=0.8, alpha=1.0)
     axes.spines[:].set_visible(False)
 

@@ -100,7 +100,7 @@ def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.set(xlabel=f"velocity after the impact [{result.unit}]", ylabel="samples [%]")
     axes.ticklabel_format(axis="x", useOffset=False)
     axes.locator_params(axis="x", nbins=_TICKS)
-    axes.grid(False, axis="x")
+    axes.grid(visible=False, axis="x")
 
 
 def _most_correlated_gaps(result: MonteCarlo, body: int) -> list[int]:
@@ -133,7 +133,7 @@ def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
     x, x_label = _in_units(result, x_gaps, gaps[0])
     axes.set_xlabel(x_label)
     axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
-    axes.grid(False)
+    axes.grid(visible=False)
     label = f"velocity of body {body + 1} [{result.unit}]"
     if len(gaps) == 1:
         axes.plot(x, velocity, ".", ms=3, color=colour_of(body))

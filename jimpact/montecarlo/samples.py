@@ -111,8 +111,8 @@ def draw(
         law = eqx.filter_vmap(sources.law)(keys[:, 0])
     else:
         law = sources.law
-    velocity = entries("velocity", scene.size, keys[:, 1], False)
-    gaps = entries("gaps", scene.contacts, keys[:, 2], True)
+    velocity = entries("velocity", scene.size, keys[:, 1], non_negative=False)
+    gaps = entries("gaps", scene.contacts, keys[:, 2], non_negative=True)
     return Sources(law, velocity, gaps)
 
 

@@ -29,10 +29,12 @@ OUTCOMES = (
     Status(
         "bad_gap",
         "a drawn gap is not finite or an overlap: see LZB's `initial_energy`",
-        True,
+        failure=True,
     ),
-    Status("bad_velocity", "a drawn velocity is not finite", True),
-    Status("bad_law", "a drawn parameter is not finite or outside its domain", True),
+    Status("bad_velocity", "a drawn velocity is not finite", failure=True),
+    Status(
+        "bad_law", "a drawn parameter is not finite or outside its domain", failure=True
+    ),
 )
 BAD_GAP, BAD_VELOCITY, BAD_LAW = range(len(STATUS), len(OUTCOMES))
 FAILURE = np.array([row.failure for row in OUTCOMES])

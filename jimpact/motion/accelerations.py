@@ -254,5 +254,5 @@ def _problem(
     system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
 ) -> ContactProblem:
     """D and B of all contacts."""
-    contacts = contacts_at(system, q, v, t, False)
+    contacts = contacts_at(system, q, v, t, friction=False)
     return ContactProblem(contacts.delassus, contacts.approach)

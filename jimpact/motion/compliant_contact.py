@@ -233,7 +233,7 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
         flow = spring_flow(problem, state, flight.aim.modes, fastest)
         stable = flow.longest
     else:
-        contacts = contacts_at(system, state.q, state.v, state.t, False)
+        contacts = contacts_at(system, state.q, state.v, state.t, friction=False)
         stable = stable_step(force, flight.aim.modes, contacts, state)
     flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
     # friction is to be decided
@@ -299,7 +299,7 @@ def _new_modes(
     m = problem.contacts
     event = run.flight.event
     phase, before = contact_modes(run.flight.aim.modes, at)
-    contacts = contacts_at(system, at.q, at.v, at.t, True)
+    contacts = contacts_at(system, at.q, at.v, at.t, friction=True)
     # by F
     pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))
     scale = jnp.max(run.fastest)

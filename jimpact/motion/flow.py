@@ -787,7 +787,7 @@ def flow_of(
     below = jax.lax.stop_gradient(jnp.minimum(gap, 0.0))
     axes = None
     if mu is not None and settings.spatial:
-        contacts = contacts_at(system, state.q, state.v, state.t, True)
+        contacts = contacts_at(system, state.q, state.v, state.t, friction=True)
         axes = slip_axes(contacts, mu, modes, scales.speed)
     return MechanicalFlow(
         system=system,

@@ -281,7 +281,9 @@ def forces(
     """The contact forces that keep the modes, and the acceleration v' with them.
 
     Equation: `W lambda + approach = 0` in the rows that the modes hold (`held_rows`),
-    `lambda_t = -mu lambda_n d` at contacts that slide, lambda = 0 at open ones.
+    `lambda_t = -mu lambda_n d` at contacts that slide (`drag` is mu d), lambda = 0 at
+    open ones. Redundant contacts that stick share tangential forces in proportion to
+    mu lambda_n, as in `numerics/friction.py`: they break loose together.
 
     `slip`: directions d, unit vectors; None: in the plane, `modes.sign`.
     """
@@ -292,26 +294,24 @@ def forces(
         return Forces(normal, None, contacts.free + contacts.moved @ normal)
     w, held, drag = _dragged(contacts, mu, modes, slip)
     right = -contacts.approach
-    none = jnp.zeros(m, w.dtype)
 
     def shared(_: Int[Array, ""], known: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Forces of held rows; tangential ones are shared by the normal forces of the
-        last pass.
+        """Forces of held rows; redundant sticking contacts share what they hold in
+        proportion to mu lambda_n of the last pass, equally where that is 0.
         """
-        # redundant sticking contacts share what they hold in proportion to mu lambda_n,
-        # as in `numerics/friction.py`: they break loose together
         last_push = jax.lax.stop_gradient(known[:m])
         press = mu * jnp.maximum(last_push, 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
-        weight = jnp.concatenate([none + 1, share])
+        weight = jnp.concatenate([jnp.ones(m, w.dtype), share])
         sizes = _sizes(w, contacts.delassus, m)
         return _least(w, right[:, None], held, weight, sizes)[:, 0]
 
-    both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
-    side = -(drag * both[:m, None]).reshape(-1)
-    both = both.at[m:].add(side)
-    acceleration = contacts.free + contacts.moved @ both
-    return Forces(both[:m], both[m:], acceleration)
+    # first equal shares, then those by the normal forces that these give
+    held_forces = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
+    sliding_forces = -(drag * held_forces[:m, None]).reshape(-1)
+    every_force = held_forces.at[m:].add(sliding_forces)
+    acceleration = contacts.free + contacts.moved @ every_force
+    return Forces(every_force[:m], every_force[m:], acceleration)
 
 
 def _dragged(

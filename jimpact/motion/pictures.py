@@ -148,7 +148,7 @@ def _finish_panel(axes: Axes, scale: float, note: str = "") -> None:
     """Draw a panel's legend with a note, and set limits that do not enlarge rounding of
     `scale`.
     """
-    axes.grid(False, axis="x")
+    axes.grid(visible=False, axis="x")
     low, high = axes.dataLim.intervaly
     if high - low < _FLAT * scale:
         middle = (low + high) / 2

@@ -437,7 +437,7 @@ def spring_flow(
     kappa = problem.tangential_stiffness
     m = problem.contacts
     assert kappa is not None
-    contacts = contacts_at(system, at.q, at.v, at.t, True)
+    contacts = contacts_at(system, at.q, at.v, at.t, friction=True)
     scales = contact_scales(force, contacts, _with_stored(force, contacts, at, fastest))
     snap = jnp.full(m, SNAP * settings.rtol, at.q.dtype)
     noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))

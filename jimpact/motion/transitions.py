@@ -438,7 +438,7 @@ def _next_modes(
     rest = strike.rest
     # what velocities before the rest would still turn, redundant contacts fight
     if mu is not None:
-        contacts = contacts_at(system, state.q, state.v, strike.t, True)
+        contacts = contacts_at(system, state.q, state.v, strike.t, friction=True)
     held = result.at_rest
     if not settings.friction:
         held_before = before.active

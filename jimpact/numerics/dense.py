@@ -545,7 +545,8 @@ def _batch_of_singular_values(
 
     Columns of U that belong to values of 0 come from the same rotations of A^T.
     """
-    all_batched: Any = SingularValues(True, True, True, True)  # type: ignore[arg-type]
+    yes: Any = True
+    all_batched = SingularValues(left=yes, values=yes, right=yes, null=yes)
     if matrices.shape[-1] > _BY_LOOP:
         left, values, right = jnp.linalg.svd(matrices)
         return SingularValues(left, values, right, _are_null(values.T).T), all_batched

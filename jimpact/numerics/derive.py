@@ -123,24 +123,26 @@ def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
     side by side, as of any function.
     """
     leaves, tree = jax.tree.flatten(argument)
-    # leaves that are no arrays
+    # leaves that are no arrays; None in the place of an array
     others = [None if eqx.is_array(x) else x for x in leaves]
-    trees: list[Any] = []
+    structures: list[Any] = []  # that of the result, once it is traced
 
     def of_arrays(*arrays: jax.Array) -> Arrays:
-        """The leaves of the result, from the arrays in the argument."""
+        """The leaves of the result, from the arrays in the argument; notes its
+        structure.
+        """
         values = iter(arrays)
         rebuilt = [next(values) if x is None else x for x in others]
         outcome = function(jax.tree.unflatten(tree, rebuilt))
-        results, result_tree = jax.tree.flatten(outcome)
-        trees[:] = [result_tree]
+        results, structure = jax.tree.flatten(outcome)
+        structures[:] = [structure]
         return tuple(results)
 
     wide = _OneLane(of_arrays)
     lanes = (x[..., None] for x, other in zip(leaves, others) if other is None)
     results = _as_it_is(wide, wide, "jacobian")(*lanes)
     alone = [x[..., 0] for x in results]
-    return jax.tree.unflatten(trees[0], alone)
+    return jax.tree.unflatten(structures[0], alone)
 
 
 def without_derivatives(values: Any, why: Exception) -> Any:

@@ -30,6 +30,9 @@ from jimpact.tools.loops import while_loop
 # short steps, or steps taken back.
 STEEPER = 1.5
 RELAX = 0.9
+# Share by which a curvature may exceed the estimate by rounding. Ten times more is
+# rounding, too.
+CURVATURE_ROUNDING = 1e-9
 # Discs grow and shrink with p: full momentum may go round and round among them. So
 # there is less of it in each quarter of the iterations.
 MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
@@ -183,7 +186,7 @@ def _with_momentum(
     step = x - at.y
     a_step = ax - at.ay
     square = jnp.vdot(step, step)
-    allowed_curvature = at.inverse_step_size * square * (1 + 1e-9)
+    allowed_curvature = at.inverse_step_size * square * (1 + CURVATURE_ROUNDING)
     overshoots = jnp.vdot(step, a_step) > allowed_curvature
     restarts = overshoots | (jnp.vdot(step, x - at.x) < 0)
     root = jnp.sqrt(1 + 4 * at.weight**2)

@@ -103,8 +103,9 @@ def is_smooth(x: Any) -> bool:
 
 
 def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
-    """x as a `Dual` with tangents of 0 if a leaf of the tree is a `Dual`, otherwise
-    x.
+    """x as a `Dual` with tangents of 0, in the directions of those in the tree.
+
+    x itself if it is a `Dual` already, or no leaf of the tree is one.
     """
     leaves = jax.tree.leaves(tree, is_leaf=is_dual)
     duals = [leaf for leaf in leaves if is_dual(leaf)]
@@ -112,8 +113,8 @@ def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
         return x
     directions = duals[0].tangents.shape[TANGENT_AXIS]
     shape = (*x.shape[:-1], directions, x.shape[-1])
-    none = jnp.zeros(shape, x.dtype)
-    return Dual(x, varying_like(none, duals))
+    no_tangents = jnp.zeros(shape, x.dtype)
+    return Dual(x, varying_like(no_tangents, duals))
 
 
 @jax.custom_jvp

@@ -155,7 +155,7 @@ def panels_of_laws(
     for axes, label in zip(panels, units):
         axes.set_ylabel(label)
     for axes in panels:
-        axes.grid(False, axis="x")
+        axes.grid(visible=False, axis="x")
     many = len(laws) > _UPRIGHT
     laws = [law.replace("lzb", "LZB") for law in laws]
     if many:

@@ -34,6 +34,9 @@ from jimpact.tools.records import counted
 # in files of ten digits. Ten times more would take measured shots for corrected ones no
 # more often.
 ROUNDING = 1e-9
+# Share of the sum of |m v-| below which momentum is 0 but for the rounding of that sum,
+# far above eps and below what readings resolve.
+_NO_MOMENTUM = 1e-12
 _VELOCITY = ("velocity", "velocities")
 _PRINTED = 4  # shots that `print` shows
 _VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
@@ -235,13 +238,13 @@ class Experiments(eqx.Module):
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`C^T M v+ / C^T M v-` (K, c) in a scene, see `momentum_excess`; inf or NaN
-        over 0.
+        where C^T M v- is 0 but for rounding.
         """
         rows = []
         with np.errstate(divide="ignore", invalid="ignore"):
             for m, pre, post in self.balances(scene):
                 before = m @ pre
-                rounding = 1e-12 * np.abs(m) @ np.abs(pre)
+                rounding = _NO_MOMENTUM * np.abs(m) @ np.abs(pre)
                 some = np.abs(before) > rounding
                 rows.append((m @ post) / np.where(some, before, 0.0))
         return _filled(rows)

@@ -179,7 +179,7 @@ def _read(
     if not path.is_file():
         raise FileNotFoundError(
             f"Data file '{path}' does not exist or is not a file (looked for in "
-            f"{Path(path).absolute().parent})."
+            f"{path.absolute().parent})."
         )
     try:
         text = path.read_text(encoding="utf-8-sig")

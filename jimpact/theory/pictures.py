@@ -131,11 +131,12 @@ def _draw_plane(
         write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
     label = "before the impact"
     axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label=label)
-    mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
+    plastic = frame(result.plastic)
+    mark(axes, plastic, "plastic, least energy", i=-1, admissible=True)
     for i, (name, v) in enumerate(marked.items()):
         admissible = bool(result.contains(v))
         mark(axes, frame(v), name, i, admissible)
-    axes.grid(False)
+    axes.grid(visible=False)
     limits = (-1.22 * r, 1.22 * r)
     axes.set(aspect="equal", xlim=limits, ylim=limits)
     axes.set_xlabel("kinetic coordinate $u_1$ [√J];  energy is $T^+ = T_c + |u|^2/2$")
@@ -346,7 +347,7 @@ def rocking_outcomes(
     theta = np.degrees(result.kinetic_angle)
     e = np.asarray(result.restitution)
     for j, axes in enumerate(panels):
-        axes.grid(False)
+        axes.grid(visible=False)
         of_friction = codes[:, j].T
         axes.pcolormesh(theta, e, of_friction, shading="nearest", **coloured)
     _critical_lines(panels, result)

@@ -266,6 +266,8 @@ _ROUNDING = 1e-12  # share of the largest that is printed as 0
 def in_numbers(values: Any) -> str:
     """An array as people read it: its first numbers; of a traced one the shape.
 
+    Numbers within rounding of the largest finite one are shown as 0.
+
     >>> import numpy as np
     >>> from jimpact.tools.checks import in_numbers
     >>> in_numbers(np.array([0.1, 2.0])), in_numbers(np.arange(20)), in_numbers(0.25)
@@ -277,14 +279,20 @@ def in_numbers(values: Any) -> str:
         return f"shape {tuple(values.shape)}"
     if array.ndim == 0:
         return f"{array.item():.6g}"
-    if array.dtype.kind == "f" and array.size:
-        array = np.where(
-            np.abs(array) <= _ROUNDING * np.nanmax(np.abs(array)), 0.0, array
-        )
+    if array.dtype.kind == "f":
+        array = _without_rounding(array)
     numbers = [f"{x:.6g}" for x in array.ravel()[:_MOST_NUMBERS].tolist()]
     if array.size > _MOST_NUMBERS:
         numbers.append(f"...; {array.size} in all")
     return f"({', '.join(numbers)})"
+
+
+def _without_rounding(array: np.ndarray) -> np.ndarray:
+    """The array with 0 for entries within rounding of the largest finite one."""
+    sizes = np.abs(array[np.isfinite(array)])
+    if not sizes.size:
+        return array
+    return np.where(np.abs(array) <= _ROUNDING * sizes.max(), 0.0, array)
 
 
 def check_kind(name: str, value: Any, kind: type, call: str = "") -> None:

@@ -126,12 +126,17 @@ def _compiled(
     @full_precision
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
-        """`function`, compiled by itself or as part of the program that calls it."""
-        if (keeper() is None and options is dict) or not is_top_level_call(
-            args, keywords
-        ):
+        """`function`, compiled by itself or as part of the program that calls it.
+
+        Part of another program, or one that is neither kept nor has options, it is that
+        of `eqx.filter_jit`; else it is loaded from the folder of kept programs, or,
+        where none are kept, the one that `program` compiles.
+        """
+        usual = keeper() is None and options is dict  # `dict()`: no options
+        if usual or not is_top_level_call(args, keywords):
             return inside(*args, **keywords)
         leaves, tree = jax.tree.flatten((args, keywords))
+        # of each leaf that is no array a tuple (x,), as None stands for an array
         fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
         arrays = [x for x in leaves if eqx.is_array(x)]
         kept = _kept(function, program, fixed, arrays)

@@ -103,6 +103,7 @@ def _lines(after: float) -> Iterator[Show]:
     time [s].
 
     Others follow each `LINE_EVERY`; where `after` is 0 one more is printed at the end.
+    Their seconds count from now, or from when `after` was made, if it is a `Patience`.
     """
     begun = getattr(after, "begun", time.monotonic())
     ended = threading.Event()

@@ -152,12 +152,10 @@ def formatted(value: Any, form: str) -> str:
     text = format(value, form)
     if isinstance(value, str):
         return text
-    if (
-        "-" in text
-        and value <= 0
-        and not re.search("[1-9]|inf", text.partition("e")[0])
-    ):
-        text = text.replace("-", "", 1).rjust(len(text) if text[0] == " " else 0)
+    mantissa = re.split("[eE]", text)[0]
+    rounds_to_zero = not re.search("[1-9]|inf", mantissa, re.IGNORECASE)
+    if rounds_to_zero and "-" in mantissa:
+        return format(abs(value), form)
     return text
 
 

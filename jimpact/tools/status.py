@@ -24,69 +24,83 @@ class Status(NamedTuple):
 # highest wins, so rows go from mild to grave. `failure` marks impacts without a usable
 # outcome and motions that end before t_end.
 STATUS = (
-    Status("ok", "resolved within tolerance", False),
+    Status("ok", "resolved within tolerance", failure=False),
     Status(
-        "impulse_not_unique", "v+ is determined, the impulses are one of many", False
+        "impulse_not_unique",
+        "v+ is determined, the impulses are one of many",
+        failure=False,
     ),
     Status(
         "order_dependent",
         "the outcome depends on the order of adjacent collisions",
-        False,
+        failure=False,
     ),
     Status(
         "several_outcomes",
         "the law allows several outcomes, this is one of them",
-        False,
+        failure=False,
     ),
     Status(
         "plastic_limit",
         "contacts re-close without end; finished in the plastic limit",
-        False,
+        failure=False,
     ),
     Status(
         "ill_conditioned",
         "the outcome depends on the tolerance by more than 10 rtol",
-        False,
+        failure=False,
     ),
     Status(
         "coarse_step",
         "steps are too long: within 3 a contact is struck again, at more than a tenth "
         "of the largest gap velocity, or in one bodies pass each other, or a disc of a "
         "pile moves by more than the least radius",
-        False,
+        failure=False,
     ),
     Status(
-        "unsolved_step", "impulses of a step are off by > 1 % of its velocities", False
+        "unsolved_step",
+        "impulses of a step are off by > 1 % of its velocities",
+        failure=False,
     ),
-    Status("energy_gain", "the outcome holds more energy than was there before", True),
     Status(
-        "inadmissible_velocity", "a contact still approaches after the impact", True
+        "energy_gain",
+        "the outcome holds more energy than was there before",
+        failure=True,
     ),
-    Status("negative_impulse", "a contact would have to pull (p < 0)", True),
-    Status("infeasible", "the law has no solution for this scene", True),
+    Status(
+        "inadmissible_velocity",
+        "a contact still approaches after the impact",
+        failure=True,
+    ),
+    Status("negative_impulse", "a contact would have to pull (p < 0)", failure=True),
+    Status("infeasible", "the law has no solution for this scene", failure=True),
     Status(
         "law_failed",
         "the law fails at an impact of the motion (see `events.status`)",
-        True,
+        failure=True,
     ),
     Status(
         "no_contact_force",
         "contact forces with friction have no solution, and the law has no impact "
         "without collision for it: LZB with `friction` has one",
-        True,
+        failure=True,
     ),
-    Status("room", "more contacts are closed than the body has `room` for", True),
-    Status("max_events", "more events than `max_events`", True),
+    Status(
+        "room", "more contacts are closed than the body has `room` for", failure=True
+    ),
+    Status("max_events", "more events than `max_events`", failure=True),
     Status(
         "max_steps",
         "the step limit, or steps that vanish, ended the impact or the motion before "
         "it was over; for an impact by LZB or Compliant try method='implicit'",
-        True,
+        failure=True,
     ),
-    Status("penetration", "a gap is negative at the start", True),
-    Status("backward", "t_end is not after t_start", True),
+    Status("penetration", "a gap is negative at the start", failure=True),
+    Status("backward", "t_end is not after t_start", failure=True),
     Status(
-        "singular_mass", "the mass matrix is not positive definite on the way", True
+        "singular_mass",
+        "the mass matrix is not positive definite on the way",
+        failure=True,
     ),
     Status(
         "out_of_range",
@@ -94,9 +108,9 @@ STATUS = (
             "an argument, the energy of the impact or a gap function on the way is "
             "outside its range"
         ),
-        True,
+        failure=True,
     ),
-    Status("not_finite", "the result or its input is NaN or infinite", True),
+    Status("not_finite", "the result or its input is NaN or infinite", failure=True),
 )
 
 CODE = {row.name: code for code, row in enumerate(STATUS)}

@@ -16,6 +16,9 @@ from scipy.integrate import cumulative_trapezoid
 NODES = 24
 ROUNDS = 60  # of Picard; each gains a factor of about 2 / (k |v| h), h the duration
 SETTLED = 1e-12  # of the length of a flight; ten times more is still far below noise
+# of that length, by which a flight may still move after all ROUNDS; ten times more is
+# the noise of good cameras
+ALMOST_SETTLED = 1e-6
 DIVERGED = 1e6  # lengths of a flight; ten times more would still be far from overflow
 # Share of a length, a duration, an acceleration, by which difference quotients move.
 # Ten times more makes errors of D of 1e-3 in slopes, which are small beside those of
@@ -89,7 +92,7 @@ def bent(
         slowing = new
         if not SETTLED * length < moved < DIVERGED * length:
             break
-    if not moved <= 1e-6 * length:
+    if not moved <= ALMOST_SETTLED * length:
         raise ValueError(
             f"Argument `drag` must be a coefficient [1/m], `acceleration` a function, "
             f"that bends flights little, but drag {float(np.max(np.abs(k))):.3g} is "

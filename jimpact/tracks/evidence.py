@@ -366,17 +366,19 @@ def largest_waves(
 
 
 def _cheapest(frames: Frames, found: Sequence[Verdict]) -> Verdict:
-    """The verdict of least cost; where one has waves impacts must save RATHER_FEW
-    beside.
+    """The verdict of least cost; where one of them has waves, each flight costs
+    RATHER_FEW more.
     """
-    waves = any(verdict.errors.number_of_waves for verdict in found)
-    if waves:
-        of_each = RATHER_FEW
+    if any(verdict.errors.number_of_waves for verdict in found):
+        cost_of_flight = RATHER_FEW
     else:
-        of_each = 0.0
-    return min(
-        found, key=lambda some: _cost(frames, some) + of_each * len(some.flights)
-    )
+        cost_of_flight = 0.0
+
+    def cost(verdict: Verdict) -> float:
+        """The cost of a verdict, that of its flights included."""
+        return _cost(frames, verdict) + cost_of_flight * len(verdict.flights)
+
+    return min(found, key=cost)
 
 
 @dataclass(frozen=True)

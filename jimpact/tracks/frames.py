@@ -14,6 +14,9 @@ LEAST_NOISE = 1e-9
 # would take noise of a tenth of a digit for rounding.
 WHOLE = 1e-3
 DIGITS = np.arange(-12, 1)  # powers of ten that are tried as steps of the last digit
+# Share of the largest value below which no step of the last digit is looked for: tables
+# of more digits end with noise. Ten times more would miss steps of five digits.
+LEAST_STEP = 1e-6
 # pixels: so many steps at most between the lowest and the highest value
 FEW_VALUES = 200
 
@@ -137,7 +140,7 @@ def rounding_step(x: np.ndarray) -> float:
     # extent
     powers = 10.0 ** DIGITS[::-1]
     for step in powers[powers <= 10 * least]:
-        if step < 1e-6 * np.abs(values).max():
+        if step < LEAST_STEP * np.abs(values).max():
             break
         if np.abs(values / step - np.round(values / step)).max() < WHOLE:
             return float(step)

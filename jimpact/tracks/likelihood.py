@@ -143,26 +143,34 @@ class Coordinate:
         return Coordinate(t, since, curve, rest, starts, self.flights[long]), long
 
     def in_pieces(self, length: int, most: int) -> "Coordinate":
-        """Pieces of flights of so many frames at most, each with a line of its own.
+        """Pieces of flights, of `length` frames at most, each with a line of its own.
 
-        Of more than `most` frames in all every second, third, .. piece.
+        Pieces of 3 frames or fewer are left out: a parabola fits them whatever their
+        errors are. Of N > `most` frames in all only each k-th piece remains, with
+        k = N / `most` rounded up. `rest` and `curve` lose their lines in each piece.
         """
         of_frame = np.repeat(np.arange(len(self.starts)), self.counts)
         place = np.arange(len(self.t)) - self.starts[of_frame]
         begins = np.flatnonzero(place % length == 0)
         ends = np.append(begins[1:], len(self.t))
-        enough = ends - begins > 3  # a parabola has three values
-        every = -(-len(self.t) // most)
-        begins = begins[enough][::every]
-        ends = ends[enough][::every]
+        enough = ends - begins > 3
+        k = -(-len(self.t) // most)
+        begins = begins[enough][::k]
+        ends = ends[enough][::k]
         rows = np.concatenate([np.arange(*pair) for pair in zip(begins, ends)])
         starts = np.cumsum(np.append(0, ends - begins))[:-1]
         t = self.t[rows]
         since = t - _mean(t, starts)
         curve = _without_line(since, since**2 / 2, starts)
         rest = _without_line(since, self.rest[rows], starts)
-        flights = self.flights[of_frame[begins]]
-        return Coordinate(t, since, curve, rest, starts, flights)
+        return Coordinate(
+            t=t,
+            since=since,
+            curve=curve,
+            rest=rest,
+            starts=starts,
+            flights=self.flights[of_frame[begins]],
+        )
 
     def together(self, most: int) -> tuple["Coordinate", int]:
         """Means of so many frames in a row that `most` are left, and of how many each

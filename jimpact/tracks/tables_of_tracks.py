@@ -40,6 +40,9 @@ FRAMES = {
     "framenr",
 }
 FRAMES |= {"frameid", "framenum"}
+# Share by which rates may differ that are one, rounded: ten times more would take 29.97
+# frames a second for 30.
+SAME_RATE = 1e-3
 # bytes of a file; ten times more would not go into most memories
 LARGEST = 2_000_000_000
 MOST_LISTED = 10  # values of a column that an error lists
@@ -167,7 +170,7 @@ def _of_capture(
     if (
         rate is not None
         and capture.rate is not None
-        and not np.isclose(rate, capture.rate, 1e-3)
+        and not np.isclose(rate, capture.rate, SAME_RATE)
     ):
         raise ValueError(
             f"{path}: the file states {capture.rate:g} frames a second, but argument "
