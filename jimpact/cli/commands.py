@@ -624,11 +624,13 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
     )
     picture = ji.plot.advice(result, study.title, study.velocities)
     text = str(result)
+    data = result.to_dict()
     scene = study.scene
     if scene.contacts > PAIR_OF_CONTACTS or scene.tangents is not None:
         enough = ji.simplest_scene(result.law, scene, before, command.tolerance)
         text = f"{text}\n\n{enough}"
-    return CommandResult(_titled(study, before), result, picture, result.table, text)
+        data["simplest_scene"] = enough.to_dict()
+    return CommandResult(_titled(study, before), data, picture, result.table, text)
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from jimpact.numerics.tridiagonal import (
     scaled,
     structure_of,
 )
-from jimpact.tools.checks import as_float_array, is_traced
+from jimpact.tools.checks import as_float_array, is_traced, suggesting_names
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision, without_rounding
 
@@ -42,6 +42,7 @@ WORTH_A_PROGRAM = 4
 Groups = tuple[np.ndarray, ...]
 
 
+@suggesting_names(W="normal_delassus", w="normal_delassus", gamma="gap_velocity")
 class Contact(eqx.Module):
     """All that a law may depend on in an impact, with derived quantities.
 

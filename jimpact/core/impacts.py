@@ -38,6 +38,7 @@ from jimpact.tools.checks import (
     in_common_dtype,
     in_numbers,
     is_traced,
+    suggesting_names,
 )
 from jimpact.tools.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.tools.precision import check_rtol, precision
@@ -59,6 +60,7 @@ ACCURACIES = 4
 SHARED = 8
 
 
+@suggesting_names(v="velocity", p="impulse", p_t="tangential_impulse")
 class Impact(eqx.Module):
     """Outcome of an impact; under `vmap` every field has the axes of the batch first.
 

@@ -20,7 +20,7 @@ from jimpact.fits.intervals import pieces_in_words
 from jimpact.fits.result import FitResult
 from jimpact.fits.search import Solution
 from jimpact.fits.uncertainty import Uncertainty
-from jimpact.tools.checks import check_kind
+from jimpact.tools.checks import check_kind, suggesting_names
 from jimpact.tools.records import as_data, counted, degrees, formatted, with_error
 from jimpact.tools.status import STATUS
 
@@ -381,7 +381,7 @@ def _sigma_sources(fit: "Fit") -> list[str]:
         lines.append(
             f"               with that of readings in steps of {size}: step / sqrt(12)"
         )
-    if data is not None and data.sigma_pre is not None:
+    if data is not None and data.sigma_pre is not None and np.any(data.sigma_pre):
         if data.covariance is not None:
             errors = "their covariance with"
         else:
@@ -688,6 +688,9 @@ def _of_this_build(result: dict[str, Any]) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+@suggesting_names(
+    restitution="law.restitution", stiffness="law.stiffness", friction="law.friction"
+)
 class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
 

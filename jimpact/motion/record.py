@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jimpact.tools.checks import suggesting_names
 from jimpact.tools.records import as_data, fields_as_data
 from jimpact.tools.status import STATUS, Status
 
@@ -132,6 +133,7 @@ def with_row(
     return dataclasses.replace(events, count=events.count + fits, **new)
 
 
+@suggesting_names(t="time", v="velocity", f="gaps")
 class Motion(eqx.Module):
     """A motion, or a batch B of them: samples at equal times, events, energies, status.
 

@@ -6,15 +6,17 @@ JAX is imported by those functions that need it: a study file is checked without
 import importlib
 import operator
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
     import jax
+
+Class = TypeVar("Class")
 
 # where chunks of a Monte Carlo run are computed
 EXECUTORS = ("threads", "serial", "devices", "dask")
@@ -257,6 +259,41 @@ def suggestion(
     if close:
         return f" Did you mean {known[close[0]]}?"
     return ""
+
+
+def suggesting_names(**short: str) -> Callable[[type[Class]], type[Class]]:
+    """Class decorator: the AttributeError for a name that objects lack suggests one.
+
+    `short` are words and letters of papers, and what to write for them, as 'velocity'
+    or 'law.restitution'. Without one the attribute spelled most like the name is
+    suggested, if any is. An AttributeError of a property that exists is raised as it
+    is.
+
+    >>> from jimpact.tools.checks import suggesting_names
+    >>> @suggesting_names(v="velocity")
+    ... class Outcome:
+    ...     velocity = 1.0
+    >>> Outcome().v
+    Traceback (most recent call last):
+    AttributeError: Outcome has no attribute `v`. Did you mean velocity?
+    """
+
+    def decorated(named: type[Class]) -> type[Class]:
+        def missing(self: Class, name: str) -> Any:
+            if name.startswith("_") or name in dir(named):
+                return object.__getattribute__(self, name)
+            annotated = getattr(named, "__dataclass_fields__", ())
+            public = {x for x in (*annotated, *dir(named)) if not x.startswith("_")}
+            if name in short:
+                advice = f" Did you mean {short[name]}?"
+            else:
+                advice = suggestion(name, sorted(public))
+            raise AttributeError(f"{named.__name__} has no attribute `{name}`.{advice}")
+
+        type.__setattr__(named, "__getattr__", missing)
+        return named
+
+    return decorated
 
 
 _MOST_NUMBERS = 8  # of an array that are printed

@@ -5,7 +5,9 @@ are as in the file: x, y, z, and qx .. qw of rigid bodies. A marker that was los
 NaN, by each format's mark.
 """
 
+import csv
 from array import array
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice, takewhile
@@ -99,11 +101,9 @@ class Capture:
                 f"{path}: marker `{marker}` has no axis `{axis}`, but "
                 f"{', '.join(self.axes[found])}."
             )
-        known = list(self.axes)
         return (
-            f"{path}: marker `{marker or name}` is "
-            f"missing{suggestion(marker or name, known)} in "
-            f"{there}. A column is 'MARKER axis'."
+            f"{path}: marker `{marker or name}` is missing in {there}."
+            f"{suggestion(marker or name, self.axes)} A column is 'MARKER axis'."
         )
 
 
@@ -113,7 +113,8 @@ def capture_of(path: Path) -> Capture | None:
         begin = file.read(64)
     if path.suffix.lower() == ".c3d":
         return _c3d(path)
-    text = begin.decode("utf-8-sig", errors="replace").lstrip()
+    encoding = encoding_of(path)
+    text = begin.decode(encoding, errors="replace").lstrip()
     readers = {
         "NO_OF_FRAMES": _qualisys,
         "FILE_VERSION": _qualisys,
@@ -123,10 +124,28 @@ def capture_of(path: Path) -> Capture | None:
     }
     for word, reader in readers.items():
         if text.strip('"').startswith(word):
-            with path.open(encoding="utf-8-sig", errors="replace") as file:
+            with path.open(encoding=encoding, errors="replace") as file:
                 lines = enumerate((line.rstrip("\n") for line in file), 1)
                 return reader(path, lines)
     return None
+
+
+def encoding_of(path: str | Path) -> str:
+    """UTF-16 of a text that begins with its mark, as spreadsheets save Unicode text;
+    else UTF-8.
+    """
+    with Path(path).open("rb") as file:
+        mark = file.read(2)
+    if mark in (BOM_UTF16_LE, BOM_UTF16_BE):
+        return "utf-16"
+    return "utf-8-sig"
+
+
+def split_cells(line: str, separator: str) -> list[str]:
+    """The cells of a line; separators within quotes belong to their cell."""
+    if '"' in line:
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return line.split(separator)
 
 
 def _number(path: Path, line: int, cell: str) -> float:
@@ -150,15 +169,23 @@ class _Rows:
     digit: float
 
 
-def _rows(path: Path, rows: Iterable[tuple[int, list[str]]], width: int) -> _Rows:
+def _rows(
+    path: Path,
+    rows: Iterable[tuple[int, list[str]]],
+    width: int,
+    counted: bool = False,
+) -> _Rows:
     """Numbers of rows of cells, one row after the other; NaN where one is shorter.
 
-    Rows without a cell that holds something are left out.
+    A row whose cells are all empty is left out; where rows are `counted`, as they hold
+    neither frame nor time, it is a frame in which nothing was seen, unless it is an
+    empty line.
     """
     found = array("d")
     digits = 0
     for line, cells in rows:
-        if not any(cell.strip() for cell in cells):
+        frame_without_a_marker = counted and len(cells) > 1
+        if not any(cell.strip() for cell in cells) and not frame_without_a_marker:
             continue
         row = [_number(path, line, cell) for cell in cells[:width]]
         found.extend(row + [np.nan] * (width - len(row)))
@@ -174,7 +201,7 @@ def _rows(path: Path, rows: Iterable[tuple[int, list[str]]], width: int) -> _Row
 def _cells(lines: Lines, separator: str) -> Iterator[tuple[int, list[str]]]:
     """Number and cells of each line."""
     for k, line in lines:
-        yield k, line.split(separator)
+        yield k, split_cells(line, separator)
 
 
 def _head(path: Path, lines: Lines, separator: str, count: int) -> list[list[str]]:
@@ -223,9 +250,10 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
         _, cells = row
         key = cells[0].strip()
         if _is_number(key) or key.lower() in ("frame", "time") or (head and not key):
-            if any(_is_number(cell) for cell in cells):
+            names_of_columns = any(cells) and not any(map(_is_number, cells))
+            if not names_of_columns:
                 rows = chain([row], rows)
-            break  # else the row has names of columns
+            break
         _, *words = cells
         head[key] = [word.strip() for word in words]
     included = (head.get("DATA_INCLUDED") or ["3D"])[0]
@@ -236,15 +264,15 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
         )
     names = [name for name in head["MARKER_NAMES"] if name]
     _check_once(path, names)
-    first = next((row for row in rows if any(row[1])), (0, [""]))
+    first = next((row for row in rows if len(row[1]) > 1), (0, [""]))
     _, cells = first
-    widest = len(cells) - (not cells[-1].strip())
-    before = max(widest - 3 * len(names), 0)  # frame, time
+    before = max(_width(cells) - 3 * len(names), 0)  # frame, time
     if before > 2:
         raise ValueError(
             f"{path}: lines have {before} cells more than {len(names)} markers need."
         )
-    values = _rows(path, chain([first], rows), before + 3 * len(names)).values
+    width = before + 3 * len(names)
+    values = _rows(path, chain([first], rows), width, counted=not before).values
     places = values[:, before:].reshape(len(values), len(names), 3)
     lost = (places == 0).all(axis=2)
     places = np.where(lost[:, :, None], np.nan, places)
@@ -255,6 +283,15 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
         t = None
     found = dict(zip(names, places.swapaxes(0, 1)))
     return Capture("Qualisys TSV", dict.fromkeys(names, PLACE), found, None, rate, t)
+
+
+def _width(cells: Sequence[str]) -> int:
+    """Number of cells of a row, without the one behind a separator at its end.
+
+    Lost markers leave three empty cells; a separator at the end leaves one more.
+    """
+    empty = sum(1 for _ in takewhile(lambda cell: not cell.strip(), reversed(cells)))
+    return len(cells) - (empty % 3 == 1)
 
 
 def _stated(path: Path, key: str, cell: str) -> float | None:

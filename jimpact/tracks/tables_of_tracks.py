@@ -2,12 +2,13 @@
 them.
 """
 
+import math
 import re
 import warnings
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain, islice
+from itertools import chain, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,13 @@ from jimpact.tracks.motion_capture import (
     Capture,
     capture_of,
     check_not_zero,
+    encoding_of,
+    split_cells,
 )
 
 # In m or rad
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+TIMES = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # in s
 UNITS |= {"rad": 1.0, "deg": np.pi / 180, "1": 1.0}
 _OTHER = r"(?:cm|mm|um|µm|km|in|ft|px|pixels?|deg|°|rad|m)"
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a"}
@@ -79,12 +83,13 @@ def read(
         path: of the file, up to 2 GB.
         columns: names of those to read, as in the file; or their numbers, from 0, in a
             table without names.
-        time: name or number of the column of times [s]; None: there is none, but a
+        time: name or number of the column of times, in s unless its name or a line of
+            units states ms, us or ns ('t [ms]', 't_us'); None: there is none, but a
             `rate`.
         frame: name or number of the column of frame numbers, of which each frame has
             its own; its time is the number over `rate`.
-        rate: frames a second, > 0; without `frame` each line is one. A rate that the
-            file states must be this.
+        rate: frames a second, > 0; without `frame` each line is one, unless it is
+            empty. A rate that the file states must be this.
         unit: of the columns, one for all or one each: m, cm, mm, um, in, ft, rad, deg,
             or 1 of a quaternion. It is never guessed; a unit that the file or a name
             ('x [mm]') states must be this. None: as stated there.
@@ -101,10 +106,10 @@ def read(
         FileNotFoundError: no such file.
         ImportError: a C3D file without ezc3d.
         ValueError: neither or both of time and rate, an unknown unit, or not that of
-            the file, no such column or two, no such marker, text in a number, no line
-            of names, times or frames that do not rise (steps dt, two takes in one
-            file), frames that are missing while `rate` counts lines; with file, line
-            and column.
+            the file, no such column or two, no such marker, text in a number, a line
+            of more cells than names, no line of names, times or frames that do not rise
+            (steps dt, two takes in one file), frames that are missing while `rate`
+            counts lines; with file, line and column.
 
     Warns:
         UserWarning: `rate` counts lines, but a column of frame numbers repeats them.
@@ -141,8 +146,11 @@ def read(
         return _of_capture(path, capture, names, rate, unit, given)
     units = _units(unit, names)
     table = _table(path, names, _Rows(time, frame, where), decimal)
-    for name, own in zip(names, units):
-        _check_unit_in_name(path, str(name), own)
+    for name, own, below in zip(names, units, table.units):
+        _check_stated_unit(path, str(name), own, stated_unit(str(name)))
+        _check_stated_unit(
+            path, str(name), own, stated_unit(f"[{below.strip('[]()')}]")
+        )
     t = _times(path, table, time, frame, rate)
     return t, table.values * [UNITS[own] for own in units]
 
@@ -254,11 +262,12 @@ class _Rows:
 
 @dataclass(frozen=True)
 class _Table:
-    """Columns (T, n), that of times or of frame numbers (T,), and numbers of frames
-    beside them.
+    """Columns (T, n), the cells of the line of units below their names and that of
+    times or frame numbers, these (T,), and numbers of frames beside them.
     """
 
     values: np.ndarray
+    units: list[str]
     order: np.ndarray | None
     beside: tuple[str, np.ndarray] | None
 
@@ -275,7 +284,7 @@ def _table(
             f"Columns must all be names, or all numbers, but are "
             f"{', '.join(map(repr, wanted))}."
         )
-    with Path(path).open(encoding="utf-8-sig", errors="replace") as file:
+    with Path(path).open(encoding=encoding_of(path), errors="replace") as file:
         first = [line.rstrip("\n") for line in islice(file, HEADER_LINES)]
         if all(numbered):
             start, separator = _without_names(path, first, wanted, decimal)
@@ -292,7 +301,10 @@ def _table(
         frames = _frames_beside(header)
         if rows.frame is not None:
             frames = []
-        for k, cells in _body(chain(first[start:], file), start + 1, separator):
+        body = _body(chain(first[start:], file), start + 1, separator, not of_rows)
+        units, body = _line_of_units(body)
+        for k, cells in body:
+            _check_width(path, k, cells, header)
             if choice.takes(cells):
                 columns.add(k, cells)
                 frames = [some for some in frames if some.takes(cells)]
@@ -308,24 +320,52 @@ def _table(
     beside = None
     if frames:
         beside = (frames[0].name, np.array(frames[0].numbers))
-    return _Table(values[:, : len(names)], order, beside)
+    below = [_cell(units, place) for place in places]
+    return _Table(values[:, : len(names)], below, order, beside)
 
 
 def _body(
-    lines: Iterable[str], start: int, separator: str | None
+    lines: Iterable[str], start: int, separator: str | None, counted: bool
 ) -> Iterator[tuple[int, list[str]]]:
-    """Number and cells of each line that is not empty; a first line without digits is
-    one of units, and left out.
+    """Number and cells of each line that is not empty.
+
+    A line whose cells are all empty is left out, too, unless lines are `counted`: then
+    it is a frame in which nothing was seen.
     """
-    first = True
     for k, line in enumerate(lines, start):
         cells = _cells(line, separator)
-        if not any(cells):
-            continue
-        units = first and not any(char.isdigit() for char in line)
-        first = False
-        if not units:
+        frame_without_a_place = counted and line.strip("\n ") != ""
+        if any(cells) or frame_without_a_place:
             yield k, cells
+
+
+def _line_of_units(
+    body: Iterator[tuple[int, list[str]]],
+) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
+    """Cells of a first line without digits, which is one of units, and the lines after
+    it; without such a line no cells, and all lines.
+    """
+    first = next(body, None)
+    if first is None:
+        return [], body
+    _, cells = first
+    text = "".join(cells)
+    if text and not any(char.isdigit() for char in text):
+        return cells, body
+    return [], chain([first], body)
+
+
+def _check_width(
+    path: str | Path, line: int, cells: list[str], header: list[str]
+) -> None:
+    """Raise where a line has something behind its last name: a name may be missing."""
+    beyond = [cell for cell in cells[len(header) :] if cell]
+    if header and beyond:
+        raise ValueError(
+            f"{path}, line {line}: a line must have at most {len(header)} cells, one "
+            f"for each name of a column, but has {len(cells)}: does a name lack, as "
+            f"that of row numbers, or is the separator a decimal mark, too?"
+        )
 
 
 @dataclass
@@ -477,7 +517,7 @@ def _times(
     if rate is None:
         assert table.order is not None
         _check_times(path, str(time), table.order)
-        return table.order
+        return table.order * _seconds(str(time), table.units[table.values.shape[1]])
     if table.beside is not None:
         _check_lines_are_frames(path, *table.beside)
     return np.arange(len(table.values)) / rate
@@ -573,9 +613,21 @@ def stated_unit(name: str) -> str | None:
     return None
 
 
-def _check_unit_in_name(path: str | Path, name: str, unit: str) -> None:
-    """Raise where the name of a column states another unit in brackets."""
-    stated = stated_unit(name)
+def _seconds(name: str, below: str) -> float:
+    """Seconds of one unit of times, which the end of a column's name, or the cell of
+    the line of units below it states: 't [ms]', 'time_us'; 1 without.
+    """
+    for text in (name, f"[{below.strip('[]()')}]"):
+        stated = re.search(r"[\[(_ ]\s*(ms|us|µs|ns)\s*[\])]?$", text.strip())
+        if stated:
+            return TIMES[stated[1]]
+    return 1.0
+
+
+def _check_stated_unit(
+    path: str | Path, name: str, unit: str, stated: str | None
+) -> None:
+    """Raise where the file states another unit of a column."""
     if stated and stated != unit:
         raise ValueError(
             f"{path}: column `{name}` states the unit {stated}, but argument `unit` is "
@@ -588,7 +640,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
     if separator is None:
         parts = line.split()
     else:
-        parts = line.split(separator)
+        parts = split_cells(line.rstrip("\n"), separator)
     return [part.strip().strip('"').strip() for part in parts]
 
 
@@ -619,11 +671,16 @@ def _header(
     its names.
 
     The first line, and for it the first separator, with which all are among its cells.
+    A mark of a comment before the first name is none of the names (`numpy.savetxt`
+    writes one), unless a wanted name has it.
     """
     separators = [x for x in SEPARATORS if x != decimal]
     for k, line in enumerate(lines[:HEADER_LINES], 1):
-        for separator in separators:
-            cells = _cells(line, separator)
+        readings = (line, re.sub(r"^\s*[#%]\s", "", line))
+        for text, separator in product(readings, separators):
+            cells = _cells(text, separator)
+            if "#" in cells and "#" not in wanted:
+                continue
             if all(name.strip() in cells for name in wanted):
                 return k, separator, cells
     likely = max(
@@ -634,9 +691,9 @@ def _header(
     missing = next((name for name in wanted if name not in likely), wanted[0])
     named = [cell for cell in likely if cell]
     raise ValueError(
-        f"{path}: no line holds the names {', '.join(f'`{name}`' for name in wanted)} "
-        f"of columns; `{missing}` is missing{suggestion(missing, named)} in "
-        f"{', '.join(named) or 'the file'}."
+        f"{path}: none of the first {HEADER_LINES} lines holds the names "
+        f"{', '.join(f'`{name}`' for name in wanted)} of columns; `{missing}` is "
+        f"missing in {', '.join(named) or 'the file'}.{suggestion(missing, named)}"
     )
 
 
@@ -650,9 +707,11 @@ def _place(path: str | Path, header: list[str], name: str) -> int:
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    """True for a cell that is a number with this decimal mark; an empty one is none."""
+    """True for a cell that is a finite number with this decimal mark; an empty one is
+    none.
+    """
     try:
-        float(cell.replace(decimal, "."))
+        number = float(cell.replace(decimal, "."))
     except ValueError:
         return False
-    return True
+    return math.isfinite(number) and "_" not in cell

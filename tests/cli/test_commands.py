@@ -438,6 +438,9 @@ def test_advice_leaves_out_contacts_that_a_chain_does_not_need(tmp_path, capsys)
     code, said = call(capsys, "advise", str(study), *speeds)
     assert code == 0
     assert re.search(r"2 of 3 contacts suffice within 1 %", said.out)
+    code, said = call(capsys, "advise", str(study), *speeds, "--json")
+    scene = json.loads(said.out)["simplest_scene"]
+    assert (scene["kept"], scene["error"] < 0.01) == ([1, 2], True)
 
 
 @pytest.mark.slow

@@ -56,3 +56,26 @@ def test_a_check_names_the_argument_its_value_and_what_is_allowed(sentence):
 def test_numbers_that_are_traced_are_refused_on_the_host():
     with pytest.raises(TypeError, match="under jit, vmap or grad"):
         jax.jit(lambda x: checks.check_concrete("law", x))(1.0)
+
+
+def test_a_name_that_results_lack_gets_the_one_to_write():
+    pair = ji.chain([1.0, 1.0])
+    out = ji.impact(ji.Newton(0.8), pair, [1.0, 0.0])
+    with pytest.raises(AttributeError, match=r"`v`.*velocity"):
+        _ = out.v
+    with pytest.raises(AttributeError, match=r"`velocty`.*velocity"):
+        _ = out.velocty
+    with pytest.raises(AttributeError, match=r"`W`.*normal_delassus"):
+        _ = ji.Contact([[1.0]], [-1.0]).W
+    assert not hasattr(out, "__array__")
+
+
+def test_an_error_inside_of_a_property_is_not_that_of_its_name():
+    @checks.suggesting_names()
+    class Broken:
+        @property
+        def value(self):
+            return self.part
+
+    with pytest.raises(AttributeError, match=r"`part`"):
+        _ = Broken().value

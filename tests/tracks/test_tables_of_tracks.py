@@ -249,3 +249,81 @@ def test_a_track_that_was_hardly_seen_is_refused():
     q[[3, 9, 30]] = 1.0
     with pytest.raises(ValueError, match="3 frames"):
         ji.tracks.find_impacts(np.arange(40) / 100, q)
+
+
+def table(folder, text, encoding="utf-8"):
+    path = folder / "table.txt"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t y\n0 3\n.5 4\n",
+        "# t y\n0 3\n.5 4\n",  # numpy.savetxt
+        "# t,y\r0,3\r.5,4\r",
+        '"t";"note; of two";"y"\n0;"a; b";3\n.5;c;4\n',
+        "t,y\n\n(s),[m]\n0,3\n.5,4\n",
+        "t,y\n(ms),(m)\n0,3\n500,4\n",
+    ],
+)
+def test_marks_quotes_and_units_of_tables(tmp_path, text):
+    t, q = ji.tracks.read(table(tmp_path, text), "y", time="t", unit="m")
+    np.testing.assert_allclose(t, [0.0, 0.5])
+    np.testing.assert_array_equal(q, [[3.0], [4.0]])
+
+
+@pytest.mark.parametrize("name", ["t [ms]", "time_ms", "Time (ms)"])
+def test_times_in_the_unit_that_their_name_states(tmp_path, name):
+    path = table(tmp_path, f"{name},y\n0,3\n8,4\n", "utf-16")
+    t, _ = ji.tracks.read(path, "y", time=name, unit="m")
+    np.testing.assert_allclose(t, [0.0, 0.008])
+
+
+@pytest.mark.parametrize("first", ["", ",\n"])
+def test_lines_of_empty_cells_are_frames_where_lines_are_counted(tmp_path, first):
+    path = table(tmp_path, f"x,y\n{first}1,2\n,\n\n3,4\n,\n")
+    t, q = ji.tracks.read(path, ["x", "y"], rate=10.0, unit="m")
+    seen = t[np.isfinite(q).all(axis=1)]
+    start = len(first) / 20
+    np.testing.assert_allclose(seen, [start, start + 0.2])
+
+
+def test_lines_with_more_cells_than_names_are_refused(tmp_path):
+    path = table(tmp_path, "t,y\n1,0.0,3\n2,0.5,4\n")
+    with pytest.raises(ValueError, match=r"line 2: .*at most 2 cells"):
+        ji.tracks.read(path, "y", time="t", unit="m")
+
+
+@pytest.mark.parametrize("cell", ['"1,000"', "inf", "1_0"])
+def test_cells_that_are_no_finite_numbers_are_refused(tmp_path, cell):
+    path = table(tmp_path, f"t,y\n0,3\n1,{cell}\n")
+    with pytest.raises(ValueError, match=r"line 3, column `y`"):
+        ji.tracks.read(path, "y", time="t", unit="m")
+
+
+def test_a_line_of_units_that_contradicts_the_argument_is_refused(tmp_path):
+    path = table(tmp_path, "t,y\ns,mm\n0,3\n1,4\n")
+    with pytest.raises(ValueError, match=r"`y` states the unit mm"):
+        ji.tracks.read(path, "y", time="t", unit="m")
+
+
+@pytest.mark.parametrize("end", ["", "\t"])
+def test_markers_that_were_lost_in_frames_of_empty_cells(tmp_path, end):
+    lost = "\t" * 5
+    rows = [lost, f"{ROWS[0]}\t{EDGE[0]}", lost, f"{ROWS[2]}\t{EDGE[2]}"]
+    path = table(tmp_path, QUALISYS + "".join(f"{x}{end}\n" for x in rows))
+    t, q = ji.tracks.read(path, ["ball z", "edge x"], unit="mm")
+    seen = np.isfinite(q).all(axis=1)
+    np.testing.assert_allclose(t[seen], [1 / 200, 3 / 200])
+    np.testing.assert_allclose(q[seen], [[0.30025, 0.011], [0.28075, 0.014]])
+
+
+def test_a_last_marker_that_is_lost_in_the_first_frame_moves_no_column(tmp_path):
+    names = "\t".join(f"{m} {a}" for m in ("ball", "edge") for a in "XYZ")
+    rows = f"1\t0.0\t{ROWS[0]}\t\t\t\n2\t0.005\t{ROWS[1]}\t{EDGE[2]}\n"
+    path = table(tmp_path, f"{QUALISYS}Frame\tTime\t{names}\n{rows}")
+    t, q = ji.tracks.read(path, ["ball z", "edge x"], unit="mm")
+    np.testing.assert_allclose(t, [0.0, 0.005])
+    np.testing.assert_allclose(q, [[0.30025, np.nan], [0.2905, 0.014]])
