@@ -135,6 +135,7 @@ def register(
     """
 
     check_kind("name", name, str)
+    kept = tuple(promises)  # an iterator has them once
 
     def enter(law: Any) -> Any:
         """Enter the class in `REGISTRY` under its name, after checks, and return it."""
@@ -144,7 +145,7 @@ def register(
             raise ValueError(
                 f"Argument `name` must be in small letters, but has value {name!r}."
             )
-        for promise in promises:
+        for promise in kept:
             check_choice("promises", promise, sorted(EVERY_PROPERTY))
         other = REGISTRY.get(name)  # of the same place: a module that is read again
         if other is not None and _place(other.law) != _place(law):
@@ -157,7 +158,7 @@ def register(
             summary=summary,
             right_when=right_when,
             fails_when=fails_when,
-            promises=frozenset(promises),
+            promises=frozenset(kept),
             source=source,
             bibtex=bibtex,
             make=make,

@@ -89,14 +89,14 @@ class Judged:
         # of each value
         rows = np.atleast_1d(problem.measured)
         shot, *_ = np.nonzero(~np.isnan(rows))
-        of_priors = np.full(len(problem.priors), NO_SHOT)
-        self.shot = np.append(shot, of_priors)
+        shot_of_priors = np.full(len(problem.priors), NO_SHOT)
+        self.shot = np.append(shot, shot_of_priors)
         self.shots = np.unique(shot)
         self.used = used = np.append(measured, np.ones(len(problem.priors), bool))
         # not the residual of the search, which is a penalty where the law fails
         errors = problem.measurement.independent(problem.measured - solution.predicted)
-        of_priors = -minimum.residual[errors.size :]
-        self.residual = np.append(errors, of_priors)[used]
+        errors_of_priors = -minimum.residual[errors.size :]
+        self.residual = np.append(errors, errors_of_priors)[used]
         self.jacobian = minimum.jacobian[used]
         self.squares = float(self.residual @ self.residual)
         self.errors = uncertainty(problem, minimum)
@@ -105,16 +105,14 @@ class Judged:
             self.stretch = 1.0
         else:
             self.stretch = self._stretch()
-        noise = self.stretch
-        if loss_noise is not None:
-            if problem.sigma is None:
-                unknown = np.nan
-            else:
-                unknown = 1.0
-            if self.freedom > 0:
-                noise = loss_noise / np.sqrt(self.freedom)
-            else:
-                noise = unknown
+        if loss_noise is None:
+            noise = self.stretch
+        elif self.freedom > 0:
+            noise = loss_noise / np.sqrt(self.freedom)
+        elif problem.sigma is None:
+            noise = np.nan  # unknown
+        else:
+            noise = 1.0  # as stated
         if noise != 1:
             self.errors = uncertainty(problem, minimum, noise)
 

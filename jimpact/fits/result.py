@@ -138,9 +138,10 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         """
         if self.known_profiles is not None:
             return self.known_profiles
-        if not (
-            self._needs_profiles if self.wants_profiles is None else self.wants_profiles
-        ):
+        wanted = self.wants_profiles
+        if wanted is None:
+            wanted = self._needs_profiles
+        if not wanted:
             return ()
         if self.wants_profiles:
             points = PROFILE_STARTS

@@ -343,8 +343,9 @@ def fit_laws(
     """
     check_kind("data", data, Experiments)
     scenes = data.each(scene, lambda s: s)
-    candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
-    _check_free(tuple(free), candidates)
+    more = tuple(free)
+    candidates, left_out = _candidates(scenes, laws, dict(values), more)
+    _check_free(more, candidates)
     fits: dict[str, Fit] = {}
     search = Search(seed=seed, progress=False)
     options: dict[str, Any] = {"starts": starts, "profiles": False, "search": search}
@@ -369,6 +370,7 @@ def fit_laws(
             )
         entries = _judged(fits)
         best = next(iter(entries))
+        # of the best one only, where they are needed
         fits[best] = replace(fits[best], wants_profiles=None)
         entries[best] = replace(entries[best], fit=fits[best])
         test = of_speed = None

@@ -362,7 +362,8 @@ def _effect_of_each_contact(
     largest = working[order][:runs]
     errors = np.zeros(len(p))
     changes = np.zeros(len(p))
-    errors[working] = changes[working] = np.nan
+    errors[working] = np.nan
+    changes[working] = np.nan
     if len(largest):
         change = trial.changes([(j,) for j in largest], reference)
         errors[largest] = norm(change)

@@ -227,14 +227,13 @@ def capped_polyhedron(
         highest = [-optimum.fun for optimum in optima]
         flat = np.array(highest) - offset <= _FLAT * radius
     _, singular, basis = np.linalg.svd(rows[flat])
-    # null space of the equalities
-    axes = basis[int((singular > _INDEPENDENT).sum()) :].T
-    solved = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)
-    centre = solved[0]
+    rank = int((singular > _INDEPENDENT).sum())
+    axes = basis[rank:].T  # null space of the equalities
+    centre, *_ = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)
     distance_squared = float(centre @ centre)
     inner = float(np.sqrt(max(radius**2 - distance_squared, 0.0)))
-    offset = offset[~flat] - rows[~flat] @ centre
-    within = _unit_rows(rows[~flat] @ axes, offset, _INDEPENDENT)
+    offset_of_u = offset[~flat] - rows[~flat] @ centre
+    within = _unit_rows(rows[~flat] @ axes, offset_of_u, _INDEPENDENT)
     return CappedPolyhedron(*within, inner), centre, axes
 
 

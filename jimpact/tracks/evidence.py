@@ -209,9 +209,13 @@ class CoordinateTask:
         acceleration = float(flight.acceleration[c])
         if flight.unknown[c]:
             some, acceleration = some.at_best(acceleration)
-        none = np.zeros(len(some.starts), bool)
-        least = float(least_noise(frames.q)[c])
-        on_lines = Likelihood(some, known, least, fastest, none)
+        on_lines = Likelihood(
+            some=some,
+            sigma=known,
+            least=float(least_noise(frames.q)[c]),
+            fastest=fastest,
+            bent=np.zeros(len(some.starts), bool),
+        )
         quick = on_lines.quick_waves(frames.step)
         return cls(on_lines, quick, acceleration, frames.step)
 

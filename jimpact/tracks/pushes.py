@@ -41,14 +41,16 @@ class Pushes:
 
     @classmethod
     def of(cls, scene: Scene) -> "Pushes":
-        """Those of a scene: normals push, tangents and constraints do both."""
+        """Those of a scene: normals of closed contacts push only, tangents and
+        constraints push and pull.
+        """
         normals = np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
         columns = [normals]
         low = [np.zeros(normals.shape[1])]
-        for other in (scene.tangents, scene.constraints):
-            if other is not None:
-                columns.append(np.asarray(other, float))
-                low.append(np.full(columns[-1].shape[1], -np.inf))
+        for both_ways in (scene.tangents, scene.constraints):
+            if both_ways is not None:
+                columns.append(np.asarray(both_ways, float))
+                low.append(np.full(both_ways.shape[1], -np.inf))
         mass = np.asarray(dense_mass(scene), float)
         return cls(np.hstack(columns), np.concatenate(low), normals.shape[1], mass)
 

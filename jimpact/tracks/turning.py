@@ -110,15 +110,15 @@ def free_rotation(
 
     start = np.concatenate([turns.as_matrix(), omegas[:, None]], axis=1).ravel()
     states = np.tile(start, (len(since), 1))
-    for some in (since < 0, since > 0):
-        if some.any():
-            # outwards from 0
-            order = np.flatnonzero(some)[:: -1 if since[some][0] < 0 else 1]
-            span = (0.0, since[order[-1]])
+    for way in (-1, 1):  # backwards, then forwards in time
+        some = np.flatnonzero(way * since > 0)
+        if some.size:
+            outwards = some[::way]
+            span = (0.0, since[outwards[-1]])
             path = solve_ivp(
-                rates, span, start, "DOP853", since[order], rtol=RTOL, atol=RTOL
+                rates, span, start, "DOP853", since[outwards], rtol=RTOL, atol=RTOL
             )
-            states[order] = path.y.T
+            states[outwards] = path.y.T
     states = states.reshape(len(since), count, 4, 3).swapaxes(0, 1)
     matrices, omega = np.split(states, [3], axis=2)
     return [Rotation.from_matrix(x) for x in matrices], omega[:, :, 0]
@@ -141,16 +141,16 @@ def fit_turning(
     """
     middle = float(t.mean())
     nearest = len(t) // 2
-    now, then = neighbours(measured)
-    steps = (now.inv() * then).as_rotvec() / np.diff(t)[:, None]
-    flight = Turning(
-        middle, measured[nearest], np.median(steps, axis=0), np.eye(6), inertia
-    )
-    flight = flight.moved(np.append((middle - t[nearest]) * flight.omega, np.zeros(3)))
+    earlier, later = neighbours(measured)
+    rates = (earlier.inv() * later).as_rotvec() / np.diff(t)[:, None]
+    omega = np.median(rates, axis=0)
+    flight = Turning(middle, measured[nearest], omega, np.eye(6), inertia)
+    turn_to_middle = (middle - t[nearest]) * omega
+    flight = flight.moved(np.append(turn_to_middle, np.zeros(3)))
     for _ in range(STEPS):
-        now = flight.at(t)
-        rest = (now.turn.inv() * measured).as_rotvec()
-        J = (now.turn_slopes / sigma[:, None]).reshape(-1, 6)
+        fitted = flight.at(t)
+        rest = (fitted.turn.inv() * measured).as_rotvec()
+        J = (fitted.turn_slopes / sigma[:, None]).reshape(-1, 6)
         step = np.linalg.lstsq(J, (rest / sigma).ravel(), rcond=None)[0]
         flight = flight.moved(step)
         turned, _ = np.split(step, 2)

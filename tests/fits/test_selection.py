@@ -345,3 +345,5 @@ def test_free_parameters_that_no_law_has_are_refused():
     scene, shots = disc_at_angles(ji.Newton(0.5, friction=0.2))
     with pytest.raises(ValueError, match="tangential_stiffness"):
         ji.fit_laws(scene, shots, ["newton"], free=["tangential_stiffness"])
+    with pytest.raises(ValueError, match="tangential_stiffness"):
+        ji.fit_laws(scene, shots, ["newton"], free=iter(["tangential_stiffness"]))

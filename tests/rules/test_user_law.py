@@ -18,6 +18,15 @@ def test_register_refuses():
         ji.register("Mine", ji.Newton)
 
 
+def test_promises_may_come_from_an_iterator():
+    promises = ("energy", "mass_scaling")
+    try:
+        ji.register("promising", ji.Moreau, promises=iter(promises))
+        assert ji.REGISTRY["promising"].promises == set(promises)
+    finally:
+        ji.REGISTRY.pop("promising", None)
+
+
 @pytest.mark.slow
 def test_contact_for_a_law_of_ones_own():
     contact = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
