@@ -711,8 +711,10 @@ class RigidBody(RigidBodies):
         a quaternion (4,); None: not turned.
         """
         if self.dimension == 2:
-            return _lowered(self, number("angle", 0.0 if turn is None else turn)[None])
-        return _lowered(self, unit_quaternion(_UPRIGHT if turn is None else turn))
+            return _lowered(self, number("turn", 0.0 if turn is None else turn)[None])
+        if turn is None:
+            turn = _UPRIGHT
+        return _lowered(self, unit_quaternion(turn, "turn"))
 
 
 def place_of(x: Any) -> Any:
@@ -810,14 +812,14 @@ def _lowered(body: RigidBody, turn: jax.Array) -> jax.Array:
     return q.at[:d].set(-jnp.min(body.gap_function(q)) * normal)
 
 
-def unit_quaternion(quaternion: Any) -> jax.Array:
-    """The argument as a quaternion (4,), scalar first; raise a ValueError unless of
+def unit_quaternion(quaternion: Any, name: str = "quaternion") -> jax.Array:
+    """Argument `name` as a quaternion (4,), scalar first; raise a ValueError unless of
     length 1.
     """
-    e = as_numbers("quaternion", quaternion, (4,), "scalar first")
+    e = as_numbers(name, quaternion, (4,), "a quaternion, scalar first")
     if not is_traced(e) and abs(float(np.linalg.norm(e)) - 1) > UNIT_WITHIN:
         raise ValueError(
-            f"Argument `quaternion` must have length 1, but has length "
-            f"{np.linalg.norm(e):g}."
+            f"Argument `{name}` must have length 1, but has length "
+            f"{np.linalg.norm(e):g}: divide by it."
         )
     return e

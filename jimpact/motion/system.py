@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
 from jimpact.bodies.functions import FunctionBody
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
 from jimpact.tools.checks import (
     as_float_array,
     check_function,
@@ -85,6 +87,13 @@ class System(eqx.Module):
         """Advice for a value that is no system, ending the message of `check_kind`."""
         if isinstance(value, Body):
             return " A body becomes one under its loads: ji.System(body, gravity=True)."
+        if isinstance(value, Law):
+            return " The system comes before the law."
+        if isinstance(value, Scene):
+            return (
+                " A scene has no places: give a body, as in "
+                "ji.System(ji.Column(masses), gravity=True)."
+            )
         return ""
 
     def __str__(self) -> str:

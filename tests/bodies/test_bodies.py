@@ -488,7 +488,7 @@ def test_turning_is_exact(brick):
 @pytest.mark.slow
 def test_a_quaternion_must_have_length_one():
     ball = ji.Sphere(0.1)
-    with pytest.raises(ValueError, match=argument("quaternion")):
+    with pytest.raises(ValueError, match=argument("turn")):
         ball.touching([2.0, 0, 0, 0])
     q = ball.touching()
     with pytest.raises(ValueError, match=argument("q")):

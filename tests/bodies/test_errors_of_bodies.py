@@ -14,7 +14,7 @@ REFUSED = [
     (lambda: ji.Block(1.0, 0.0, corners="base").scene(), r"`height`"),
     (lambda: ji.Block(1.0, 1.0, np.nan, corners="base").scene(), r"`mass`"),
     (lambda: ji.Block(1.0, 1.0, inertia=-0.1, corners="base").scene(), r"`inertia`"),
-    (lambda: ji.Block(1.0, 1.0).touching(np.inf), r"`angle`"),
+    (lambda: ji.Block(1.0, 1.0).touching(np.inf), r"`turn`"),
     (lambda: ji.Block([1.0, 2.0], 1.0, corners="base").scene(), r"`width`.*one number"),
     (
         lambda: ji.Block(1.0, 1.0, corners="three"),
@@ -100,7 +100,7 @@ REFUSED = [
     (lambda: ji.Sphere(-1.0), r"`radius`"),
     (
         lambda: ji.Sphere(1.0).touching([1.0, 1.0, 0, 0]),
-        r"`quaternion` must have length 1",
+        r"`turn` must have length 1",
     ),
     (lambda: ji.Sphere(1.0).scene([0, 0, 1.0, 1, 0, 0]), r"`q` must have shape \(7,\)"),
     (lambda: ji.Dimer(-0.1, 1.0).scene(), r"`radius`"),
@@ -108,7 +108,7 @@ REFUSED = [
     (lambda: ji.Dimer(0.0, 0.0).scene(), r"`length`"),
     (lambda: ji.Dimer(0.1, 1.0, rod_mass=-1.0).scene(), r"`rod_mass`"),
     (lambda: ji.SpatialDimer(0.0, 1.0).scene(), r"`radius`"),
-    (lambda: ji.SpatialDimer(0.1, 1.0).touching([1.0, 1.0, 0.0, 0.0]), r"`quaternion`"),
+    (lambda: ji.SpatialDimer(0.1, 1.0).touching([1.0, 1.0, 0.0, 0.0]), r"`turn`"),
     (lambda: ji.Corner(np.pi).scene(), r"`angle`"),
     (lambda: ji.Corner(-0.1).scene(), r"`angle`"),
     (lambda: ji.Bodies([]), "`bodies` must hold one or more"),

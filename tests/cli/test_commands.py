@@ -796,7 +796,7 @@ def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
 
 
 def test_the_module_ends_with_the_exit_code_of_the_command():
-    command = [sys.executable, "-m", "jimpact.cli", "fti"]
+    command = [sys.executable, "-m", "jimpact", "fti"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "Did you mean fit?" in done.stderr

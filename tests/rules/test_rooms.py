@@ -62,10 +62,12 @@ def imports_in(path):
 
 
 def modules(folder=PACKAGE):
+    """Modules of rooms; what `python -m jimpact` runs lies above them all."""
+    program = folder / "__main__.py"
     return {
         ".".join(path.relative_to(folder.parent).with_suffix("").parts): path
         for path in folder.rglob("*.py")
-        if path.name != "__init__.py"
+        if path.name != "__init__.py" and path != program
     }
 
 
