@@ -179,7 +179,7 @@ def _rows(
 
     A row whose cells are all empty is left out; where rows are `counted`, as they hold
     neither frame nor time, it is a frame in which nothing was seen, unless it is an
-    empty line.
+    empty line. A ValueError of a row with something beyond `width`.
     """
     found = array("d")
     digits = 0
@@ -187,6 +187,12 @@ def _rows(
         frame_without_a_marker = counted and len(cells) > 1
         if not any(cell.strip() for cell in cells) and not frame_without_a_marker:
             continue
+        beyond = [cell for cell in cells[width:] if cell.strip()]
+        if beyond:
+            raise ValueError(
+                f"{path}, line {line}: a line must have at most {width} cells, as many "
+                f"as the head has columns, but has {len(cells)}."
+            )
         row = [_number(path, line, cell) for cell in cells[:width]]
         found.extend(row + [np.nan] * (width - len(row)))
         if len(cells) > 1:

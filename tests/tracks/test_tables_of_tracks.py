@@ -327,3 +327,9 @@ def test_a_last_marker_that_is_lost_in_the_first_frame_moves_no_column(tmp_path)
     t, q = ji.tracks.read(path, ["ball z", "edge x"], unit="mm")
     np.testing.assert_allclose(t, [0.0, 0.005])
     np.testing.assert_allclose(q, [[0.30025, np.nan], [0.2905, 0.014]])
+
+
+def test_rows_with_more_cells_than_the_head_of_motion_capture_are_refused(tmp_path):
+    path = table(tmp_path, trc().replace(f"{ROWS[2]}\t", f"{ROWS[2]}\t7.0\t"))
+    with pytest.raises(ValueError, match=r"line 9: .*at most 8 cells"):
+        ji.tracks.read(path, "ball z")
