@@ -345,16 +345,16 @@ def _cause(advice: Advice) -> str:
     if advice.reference == "compliant":
         apart = share(advice.reclosing)
         return (
-            f"contacts open and close again, where lzb and compliant are up to "
-            f"{apart} apart"
+            f"contacts open and close again, where lzb and compliant differ by up to "
+            f"{apart}"
         )
     if advice.name == "newton" and _is_plastic(advice.law):
         return "plastic contacts (restitution 0) that stay together"
     if advice.name == advice.reference and not advice.unknown:
         return (
             f"{stiffnesses}, taken as known: {advice.name} is the reference itself, "
-            f"and compliant, with springs in the place of its energies, is "
-            f"{share(advice.reclosing)} apart"
+            f"and compliant, with springs in the place of its energies, differs from "
+            f"it by {share(advice.reclosing)}"
         )
     return (
         f"{stiffnesses}: {advice.name} is within "

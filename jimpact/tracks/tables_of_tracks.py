@@ -573,7 +573,7 @@ def _check_rising(path: str | Path, what: str, t: np.ndarray) -> None:
     else:
         why = "are these two takes in one file, or several bodies (`where`)?"
     raise ValueError(
-        f"{path}: {what} must rise, but goes from {t[k]:g} to {t[k + 1]:g} at row "
+        f"{path}: {what} must rise, but {t[k]:g} is followed by {t[k + 1]:g} in row "
         f"{k + 2}: {why}"
     )
 
