@@ -48,7 +48,8 @@ def as_covariance(
     if array.shape not in (of_each, of_all):
         raise ValueError(
             f"Argument `covariance` must have shape {of_each}, (v-, v+) of each shot, "
-            f"or {of_all}, of all shots, but has shape {array.shape}."
+            f"or {of_all}, of all shots, but has shape {array.shape}. Rows and columns "
+            f"of v- are 0 where they have no errors."
         )
     check_values("covariance", array)
     blocks = diagonal_blocks(array, 2 * n)
