@@ -40,10 +40,12 @@ LOOKED_AT = 400
 MOST_BODIES = 6
 ALTERNATING = 10.0
 
-# Share of the flights on both sides that flights within one contact last at most, and
-# of the jumps by which velocities turn back within these; of bounces it is a half.
-# Three times more: any impacts are one.
+# Share of the flights on both sides that flights within one contact last at most. Three
+# times more: any impacts are one.
 WITHIN = 0.3
+# Share of all changes of velocity, by jumps and in the flight between, that two pushes
+# of one contact leave at least; two bounces leave a third. Half of it: bounces pass.
+ONWARD = 0.5
 
 NO_IMPACT = "No impact was found"  # how its finding begins
 
@@ -386,16 +388,16 @@ def _of_lasting_contacts(arcs: Arcs, step: float) -> list[str]:
     pressed. `step`: from frame to frame [s].
 
     Flights between them last less than WITHIN of those on both sides. Of bounces the
-    velocity turns back in the flights between, here it does so by less than that share
-    of the jumps.
+    velocity turns back in the flights between; here two impacts leave ONWARD of all
+    changes or more.
     """
     pre, post = arcs.velocities()
-    jumps = np.add(*neighbours(post - pre))
     at = arcs.instants_of_impacts
-    before, _ = neighbours(post)
-    _, after = neighbours(pre)
-    back = -((after - before) * jumps).sum(axis=1)
-    onward = back < WITHIN * (jumps**2).sum(axis=1)
+    begin, arriving = neighbours(pre)
+    leaving, end = neighbours(post)
+    changes = [leaving - begin, arriving - leaving, end - arriving]
+    path = sum(np.linalg.norm(change, axis=1) for change in changes)
+    onward = np.linalg.norm(end - begin, axis=1) > ONWARD * path
     found = []
     first = 0
     for k in range(1, len(at) + 1):

@@ -269,7 +269,7 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     1. Fit the arcs; first at fixed instants, as nothing determines one without a jump.
     2. Join two flights without a jump of SMALLEST_JUMP, or as `_without_false` says;
        fit again.
-    3. Find the errors again, where flights were joined; fit again.
+    3. Find waves again, where flights that have them were joined; fit again.
     4. Take the errors of the residuals, where they are unknown or clearly larger, and
        those of times, where residuals grow with the speed; fit again.
     """
@@ -291,7 +291,7 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
         if joined is None:
             break
         start = joined
-    if len(start.flights) < len(verdict.flights):
+    if len(start.flights) < len(verdict.flights) and verdict.errors.number_of_waves:
         start = with_likely_errors(search, start)
         arcs = _arcs(search.frames, start)
     sigma = of_residuals(arcs, search.frames)
