@@ -363,6 +363,8 @@ def rooms_that_stand_on(room):
     """The room, and all whose files import it, directly or not."""
     uses = {x: set() for x in STOREY}
     for module, path in modules().items():
+        if module.endswith("__main__"):
+            continue
         uses[room_of(module)] |= {
             room_of(imported) for imported, _, _ in imports_of(path)
         }
