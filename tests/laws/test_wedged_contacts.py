@@ -47,7 +47,10 @@ def unreached(mass, normals, tangents):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "coordinates"), [(3, 3), (4, 4)])
+@pytest.mark.parametrize(
+    ("seed", "coordinates"),
+    [(3, 3), pytest.param(4, 4, marks=pytest.mark.release)],
+)
 def test_wedged_contacts_end_at_their_limit(seed, coordinates):
     scenes = planar_scenes(seed, 400, coordinates)
     out = jax.jit(jax.vmap(impact))(*scenes)

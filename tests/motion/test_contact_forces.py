@@ -212,7 +212,7 @@ def test_a_box_strikes_on_its_corners_with_friction():
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_box_that_lands_flat_drags_a_corner_through_its_end_of_slip():
     """Beside Radau with regularized friction, eps = 1e-7 m/s (scipy), of which 1e-6 are left."""
     size, turn = [0.2, 0.14, 0.1], 0.26

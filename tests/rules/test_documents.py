@@ -122,7 +122,7 @@ def documents(paths, long_run=()):
 
 LONGEST = ("mujoco", "gradient_descent", "speed_accuracy", "waves")
 LONGEST += ("02", "03", "05", "06", "07", "08", "09")
-LONGEST += ("10", "11", "12", "13", "14", "15", "16", "17", "18")
+LONGEST += ("10", "11", "12", "13", "14", "15", "16", "17", "18", "19")
 
 
 @pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))
