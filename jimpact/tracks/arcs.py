@@ -24,6 +24,7 @@ from scipy.linalg import solveh_banded
 from jimpact.tracks.drag import between
 from jimpact.tracks.flight import Flight
 from jimpact.tracks.frames import Frames, neighbours
+from jimpact.tracks.likelihood import ROUNDED
 from jimpact.tracks.waves import Errors
 
 # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
@@ -39,9 +40,6 @@ LARGEST_MOVE = 0.45
 # Share of a frame below which the instants have settled, and the places in their parts.
 # Ten times more is still far below noise.
 SETTLED = 1e-7
-# Share of the diagonal of the normal matrix by which it stays positive definite where
-# no frame lies between two instants. Ten times more is still far below noise.
-ROUNDED = 1e-12
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,6 @@ COARSER = 4.0
 # Share of the frames in flights that are not held from which on those that bend make
 # all bend. A tenth of it would free all flights of a body that slides at times.
 MOSTLY = 0.4
-
-
 # Jump of a velocity, in velocities of the waves, up to which it is theirs: waves move
 # places so without an impact. Of a real wave few are larger; ten times more would lose
 # impacts of half the speed of the flights.
@@ -165,8 +163,7 @@ class FlightCosts:
         return Costs(line, parabola, least, ends)
 
 
-# ----------------------------------------------------------------------------- errors
-# of places
+# -------------------------------------------------------------------- errors of places
 
 
 class Explained(NamedTuple):
@@ -326,8 +323,7 @@ def held_rather(
     return held
 
 
-# ------------------------------------------------------------------------------ which
-# are impacts
+# ------------------------------------------------------------------- which are impacts
 
 
 def judged(

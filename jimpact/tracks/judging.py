@@ -46,6 +46,10 @@ WITHIN = 0.3
 # Share of all changes of velocity, by jumps and in the flight between, that two pushes
 # of one contact leave at least; two bounces leave a third. Half of it: bounces pass.
 ONWARD = 0.5
+# Contact that a finding names, in the time from the first to the last of its pushes:
+# forces begin before the first one and end after the last. Of ten times more no frames
+# would be left.
+WHOLE_CONTACT = 1.5
 
 NO_IMPACT = "No impact was found"  # how its finding begins
 
@@ -409,10 +413,11 @@ def _of_lasting_contacts(arcs: Arcs, step: float) -> list[str]:
             at[first] - arcs.instants[first], arcs.instants[last + 2] - at[last]
         )
         if last > first and lasting < WITHIN * outer:
+            contact = WHOLE_CONTACT * lasting + 2 * step
             found.append(
                 f"Impacts {first + 1} to {last + 1} are pushes within {lasting:.2g} s: "
                 f"perhaps one contact that lasts, as of a spring or magnets. With "
-                f"contact={1.5 * lasting + 2 * step:.2g} it is one impact."
+                f"contact={contact:.2g} it is one impact."
             )
         first = k
     return found

@@ -28,7 +28,8 @@ LEAST_TIME = 5.0
 LEAST_MEANS = 2.0
 TURNS = 2  # of white errors beside waves; more change them by less than a hundredth
 # Share of the diagonal of normal matrices by which they are kept from being singular
-# where a flight has one frame. Ten times more is still far below noise.
+# where a flight has one frame, or two instants none between them. Ten times more is
+# still far below noise.
 ROUNDED = 1e-12
 # Frames by which slow waves are looked for; more are taken together. Ten times more
 # take ten times as long, and waves are slow.
@@ -287,14 +288,15 @@ class Likelihood:
         Of slow waves, `quick` ones, and slow ones beside quick ones those that cost
         least.
         """
-        if not self.shows_waves(self.white().sigma):
-            return self.at(())
+        white = self.white()
+        best = self.at(())
+        if not self.shows_waves(white.sigma):
+            return best
         tried = {quick, self._slow_waves(step)}
         if quick:
             tried.add(self._slow_waves(step, quick) + quick)
         found = [self._beside(waves) for waves in tried if waves]
-        paid = self.white().cost
-        best = self.at(())
+        paid = white.cost
         for likely in found:
             cost = likely.cost + self.price_of_waves(len(likely.waves))
             if cost < paid:

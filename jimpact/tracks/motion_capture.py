@@ -6,6 +6,7 @@ NaN, by each format's mark.
 """
 
 import csv
+import math
 from array import array
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Iterator, Sequence
@@ -148,19 +149,29 @@ def split_cells(line: str, separator: str) -> list[str]:
     return line.split(separator)
 
 
+def is_number(cell: str, decimal: str = ".") -> bool:
+    """True for a cell that is a finite number with this decimal mark; an empty one is
+    none.
+    """
+    try:
+        number = float(cell.replace(decimal, "."))
+    except ValueError:
+        return False
+    return math.isfinite(number) and "_" not in cell
+
+
 def _number(path: Path, line: int, cell: str) -> float:
     """A cell as a number, NaN where it is empty."""
     cell = cell.strip().strip('"')
     if not cell or cell.lower() in ("nan", "null", "na"):
         return np.nan
-    try:
-        return float(cell)
-    except ValueError:
-        raise ValueError(f"{path}, line {line}: {cell!r} must be a number.") from None
+    if not is_number(cell):
+        raise ValueError(f"{path}, line {line}: {cell!r} must be a number.")
+    return float(cell)
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _Numbers:
     """Numbers (T, width) of rows, and the last `digit` of their second cells, times
     [s].
     """
@@ -174,7 +185,7 @@ def _rows(
     rows: Iterable[tuple[int, list[str]]],
     width: int,
     counted: bool = False,
-) -> _Rows:
+) -> _Numbers:
     """Numbers of rows of cells, one row after the other; NaN where one is shorter.
 
     A row whose cells are all empty is left out; where rows are `counted`, as they hold
@@ -201,7 +212,7 @@ def _rows(
         raise ValueError(
             f"{path}: there are no lines of numbers below the names of the markers."
         )
-    return _Rows(np.array(found).reshape(-1, width), 10.0**-digits)
+    return _Numbers(np.array(found).reshape(-1, width), 10.0**-digits)
 
 
 def _cells(lines: Lines, separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -226,15 +237,6 @@ def _in_threes(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray
     return {name: places[:, k] for k, name in enumerate(names)}
 
 
-def _is_number(cell: str) -> bool:
-    """True for text that is a number."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _check_once(path: Path, names: Sequence[str]) -> None:
     """Raise a ValueError unless each marker has its own name, and there is one."""
     twice = sorted({x for x in names if names.count(x) > 1})
@@ -255,8 +257,8 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
     for row in rows:
         _, cells = row
         key = cells[0].strip()
-        if _is_number(key) or key.lower() in ("frame", "time") or (head and not key):
-            names_of_columns = any(cells) and not any(map(_is_number, cells))
+        if is_number(key) or key.lower() in ("frame", "time") or (head and not key):
+            names_of_columns = any(cells) and not any(map(is_number, cells))
             if not names_of_columns:
                 rows = chain([row], rows)
             break
@@ -304,7 +306,7 @@ def _stated(path: Path, key: str, cell: str) -> float | None:
     """A rate that a head states, > 0; None where it does not."""
     if not cell.strip():
         return None
-    if _is_number(cell):
+    if is_number(cell):
         rate = float(cell)
     else:
         rate = 0.0

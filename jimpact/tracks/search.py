@@ -11,7 +11,7 @@ from jimpact.tracks.clock import with_clock
 from jimpact.tracks.division import SMALLEST_JUMP, divided, price_of_lost
 from jimpact.tracks.evidence import Verdict, doubtful, judged, likely_errors
 from jimpact.tracks.flight import Flight
-from jimpact.tracks.frames import Frames, differences, least_noise, median
+from jimpact.tracks.frames import Frames, least_noise, median
 from jimpact.tracks.held import free_flights
 from jimpact.tracks.waves import Errors
 
@@ -474,8 +474,3 @@ def doubts(search: Search, arcs: Arcs) -> np.ndarray:
     """
     members: Sequence[np.ndarray] = arcs.members
     return doubtful(search.straight, members, arcs.flight, arcs.errors)
-
-
-def third_differences(frames: Frames, every: int) -> np.ndarray:
-    """Medians (n,) of sizes of third differences of every so-manieth row."""
-    return np.array([median(np.abs(differences(x, 3, every))) for x in frames.q.T])

@@ -2,7 +2,6 @@
 them.
 """
 
-import math
 import re
 import warnings
 from array import array
@@ -17,18 +16,20 @@ import numpy as np
 from jimpact.tools.checks import check_values, short_repr, suggestion
 from jimpact.tracks.motion_capture import (
     PLACE,
+    RATE_WITHIN,
     TURN,
     Capture,
     capture_of,
     check_not_zero,
     encoding_of,
+    is_number,
     split_cells,
 )
 
 # In m or rad
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-TIMES = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # in s
 UNITS |= {"rad": 1.0, "deg": np.pi / 180, "1": 1.0}
+TIMES = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # in s
 _OTHER = r"(?:cm|mm|um|µm|km|in|ft|px|pixels?|deg|°|rad|m)"
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a"}
 SEPARATORS = ("\t", ";", ",", None)  # None: any white space
@@ -44,9 +45,6 @@ FRAMES = {
     "framenr",
 }
 FRAMES |= {"frameid", "framenum"}
-# Share by which rates may differ that are one, rounded: ten times more would take 29.97
-# frames a second for 30.
-SAME_RATE = 1e-3
 # bytes of a file; ten times more would not go into most memories
 LARGEST = 2_000_000_000
 MOST_LISTED = 10  # values of a column that an error lists
@@ -147,10 +145,8 @@ def read(
     units = _units(unit, names)
     table = _table(path, names, _Rows(time, frame, where), decimal)
     for name, own, below in zip(names, units, table.units):
-        _check_stated_unit(path, str(name), own, stated_unit(str(name)))
-        _check_stated_unit(
-            path, str(name), own, stated_unit(f"[{below.strip('[]()')}]")
-        )
+        for text in (str(name), _in_brackets(below)):
+            _check_stated_unit(path, str(name), own, stated_unit(text))
     t = _times(path, table, time, frame, rate)
     return t, table.values * [UNITS[own] for own in units]
 
@@ -178,7 +174,7 @@ def _of_capture(
     if (
         rate is not None
         and capture.rate is not None
-        and not np.isclose(rate, capture.rate, SAME_RATE)
+        and not np.isclose(rate, capture.rate, RATE_WITHIN)
     ):
         raise ValueError(
             f"{path}: the file states {capture.rate:g} frames a second, but argument "
@@ -437,7 +433,7 @@ class _Columns:
                 other = ","
             else:
                 other = "."
-            if other in cell or not _is_number(cell, self.decimal):
+            if other in cell or not is_number(cell, self.decimal):
                 raise ValueError(
                     f"{self.path}, line {line}, column `{name}`: {cell!r} must be a "
                     f"number with the decimal mark {self.decimal!r} (argument "
@@ -613,11 +609,16 @@ def stated_unit(name: str) -> str | None:
     return None
 
 
+def _in_brackets(cell: str) -> str:
+    """A cell of the line of units as a unit in the name of a column: '[mm]'."""
+    return f"[{cell.strip('[]()')}]"
+
+
 def _seconds(name: str, below: str) -> float:
     """Seconds of one unit of times, which the end of a column's name, or the cell of
     the line of units below it states: 't [ms]', 'time_us'; 1 without.
     """
-    for text in (name, f"[{below.strip('[]()')}]"):
+    for text in (name, _in_brackets(below)):
         stated = re.search(r"[\[(_ ]\s*(ms|us|µs|ns)\s*[\])]?$", text.strip())
         if stated:
             return TIMES[stated[1]]
@@ -656,7 +657,7 @@ def _without_names(
     for k, line in enumerate(lines[:HEADER_LINES]):
         for separator in (x for x in SEPARATORS if x != decimal):
             cells = _cells(line, separator)
-            if len(cells) > last and _is_number(cells[int(wanted[0])], decimal):
+            if len(cells) > last and is_number(cells[int(wanted[0])], decimal):
                 return k, separator
     raise ValueError(
         f"{path}: no line has a number in column {wanted[0]} and {last + 1} columns "
@@ -685,7 +686,7 @@ def _header(
                 return k, separator, cells
     likely = max(
         (_cells(line, x) for line in lines[:HEADER_LINES] for x in separators),
-        key=lambda cells: sum(not _is_number(c, decimal) and c != "" for c in cells),
+        key=lambda cells: sum(not is_number(c, decimal) and c != "" for c in cells),
         default=[],
     )
     missing = next((name for name in wanted if name not in likely), wanted[0])
@@ -704,14 +705,3 @@ def _place(path: str | Path, header: list[str], name: str) -> int:
             f"{path}: column `{name}` must be there once, but is {count} times."
         )
     return header.index(name.strip())
-
-
-def _is_number(cell: str, decimal: str) -> bool:
-    """True for a cell that is a finite number with this decimal mark; an empty one is
-    none.
-    """
-    try:
-        number = float(cell.replace(decimal, "."))
-    except ValueError:
-        return False
-    return math.isfinite(number) and "_" not in cell

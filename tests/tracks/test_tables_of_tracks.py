@@ -140,6 +140,21 @@ def test_units_that_contradict_the_file_or_are_not_stated(tmp_path):
     np.testing.assert_allclose(q, PLACES[:, :2] / 1000)
 
 
+def test_a_rate_beside_that_of_the_file_must_be_the_same(tmp_path):
+    """An error of .1 %, as of 59.94 and 60 frames a second, is another rate."""
+    path = written(tmp_path, qualisys(False))
+    ji.tracks.read(path, "ball z", unit="mm", rate=200.02)
+    with pytest.raises(ValueError, match=r"`rate` is 199\.8"):
+        ji.tracks.read(path, "ball z", unit="mm", rate=199.8)
+
+
+@pytest.mark.parametrize("cell", ["inf", "1_0"])
+def test_cells_of_motion_capture_that_are_no_finite_numbers_are_refused(tmp_path, cell):
+    path = written(tmp_path, VICON.replace("300.25", cell))
+    with pytest.raises(ValueError, match=rf"line \d+.*'{cell}'"):
+        ji.tracks.read(path, "ball z")
+
+
 def test_poses_of_rigid_bodies(tmp_path):
     columns = [f"cube {axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     _, q = ji.tracks.read(written(tmp_path, OPTITRACK), columns)
