@@ -83,6 +83,38 @@ def test_readme_is_short():
     assert max(map(len, README.splitlines())) <= 120
 
 
+def captions():
+    """Names of the pages under each caption of the sidebar."""
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    trees = re.findall(r":caption: ([\w-]+)\n:hidden:\n\n(.*?)```", index, re.S)
+    return {caption: names.split() for caption, names in trees}
+
+
+def test_pages_but_references_are_short():
+    """At most 2 000 words: who reads a page from its top comes to its end."""
+    pages = captions()
+    assert list(pages) == ["Tutorials", "How-to", "Reference", "Background"]
+    for name in pages["Tutorials"] + pages["How-to"] + pages["Background"]:
+        path = ROOT / "docs" / f"{name}.md"
+        if path.exists():  # others are generated
+            assert len(path.read_text(encoding="utf-8").split()) <= 2000, name
+
+
+def test_every_page_has_a_kind():
+    named = {name for names in captions().values() for name in names}
+    assert {path.stem for path in DOCS} - {"index", "paper"} <= named  # a manuscript
+
+
+def test_figures_have_scripts():
+    """What `docs/figures.md` lists is printed by a file that exists."""
+    page = (ROOT / "docs" / "figures.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \[.*$", page, re.M)
+    assert len(rows) > 10
+    for row in rows:
+        script = row.split("|")[3].split("`")[1].split()[0]
+        assert script == "jimpact" or (ROOT / script).exists(), row
+
+
 def runs_here(block):
     """Whether the modules that a block imports are installed: engines may not be."""
     names = re.findall(r"^(?:>>> )?(?:import|from) (\w+)", block, re.M)

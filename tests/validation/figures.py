@@ -140,6 +140,35 @@ def accumulations() -> None:
             )
 
 
+def order_of_time_stepping() -> None:
+    """motions_reference.md: mean errors of time stepping over its step, beside events."""
+    ball = ji.System(lambda q: q, [1.0], potential=ji.gravity([1.0]))
+    pair = ji.System(
+        lambda q: jnp.stack([q[0], q[1] - q[0]]),
+        [1.0, 1.0],
+        potential=ji.gravity([1.0, 1.0]),
+    )
+    cradle = ji.System(ji.PendulumCradle([0.1] * 3, 0.15, 0.0125), gravity=True)
+    cases = {
+        "ball, two bounces [m]": (ball, ji.Newton(0.7), [1.0], 1.5),
+        "cradle, one impact [rad]": (cradle, ji.LZB(0.9), [-0.5, 0.0, 0.0], 0.5),
+        "two balls [m]": (pair, ji.Moreau(0.6), [0.5, 1.2], 0.9),
+    }
+    for name, (system, law, q0, t_end) in cases.items():
+        v0 = np.zeros(len(q0))
+        exact = ji.simulate(system, law, q0, v0, t_end)
+        print(f"{name}, {len(exact.event_times('impact'))} impacts:", end="")
+        for step in (1e-2, 1e-3, 1e-4):
+            errors = []
+            # one error jumps by where the impacts lie in their steps
+            for share in np.linspace(0.75, 1.25, 20):
+                method = ji.TimeStepping(step * share)
+                found = ji.simulate(system, law, q0, v0, t_end, method=method)
+                errors.append(np.abs(found.q[-1] - exact.q[-1]).max())
+            print(f"  step {step:g}: {np.mean(errors):.1e}", end="")
+        print()
+
+
 def peak(time: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
     """Time and height of the largest force (parabola), time above half of it; as in waves.md."""
     i = int(force.argmax())
@@ -210,6 +239,7 @@ FIGURES: dict[str, Callable[[], None]] = {
         planar_friction,
         stacked_balls,
         accumulations,
+        order_of_time_stepping,
         solitary_wave,
         correlated,
     )
