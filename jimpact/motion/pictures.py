@@ -430,12 +430,12 @@ def _draw_energies(
     # the sum: in a multiple impact the shares of single contacts may have either sign
     shares = contact_shares(motion)
     first, *more = shares
-    label = f"{first.removeprefix('the ')} took"
+    label = f"{first.removeprefix('the ')} absorbed"
     axes.plot(time, -shares[first], color=COLOURS[0], label=label)
     others: tuple[tuple[str, Any], ...] = (
-        *((f"{name} took", -shares[name]) for name in more),
-        ("the base gave", motion.base_work),
-        ("forces gave", motion.force_work),
+        *((f"{name} absorbed", -shares[name]) for name in more),
+        ("the base supplied", motion.base_work),
+        ("forces supplied", motion.force_work),
     )
     largest = np.nanmax(np.abs(motion.energy), initial=0.0)
     rounding = _FLAT * float(largest)

@@ -50,10 +50,10 @@ class Events(eqx.Module):
 
     `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the
     impact at which the rest of an infinite sequence is passed; by estimates from its
-    energy, the force that presses and what the impact took, `accumulation_end` [s] is
-    when that sequence would end, and `accumulation_gap` [m] how far its contacts might
-    still have opened. A `paroxysm` is an impact without collision. `energy` (2, m) is
-    what each contact gave (< 0: took), normally and tangentially.
+    energy, the force that presses and what the impact absorbed, `accumulation_end` [s]
+    is when that sequence would end, and `accumulation_gap` [m] how far its contacts
+    might still have opened. A `paroxysm` is an impact without collision. `energy`
+    (2, m) is what each contact supplied (< 0: absorbed), normally and tangentially.
     """
 
     count: Int[AnyArray, "..."]
@@ -397,13 +397,13 @@ def contact_shares(motion: Motion) -> dict[str, np.ndarray]:
 
 
 def _work_report(works: dict[str, Any]) -> str:
-    """Sentence of the works [J] by source, `gave` > 0 and `took` < 0; roundings are
+    """Sentence of the works [J] by source, supplied > 0 and absorbed < 0; roundings are
     left out.
     """
     sizes = (abs(float(work)) for work in works.values())
     least = _ROUNDING * max(sizes)
     parts = [
-        f"{source} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
+        f"{source} {'absorbed' if work < 0 else 'supplied'} {abs(float(work)):.4g} J"
         for source, work in works.items()
         if abs(float(work)) > least
     ]

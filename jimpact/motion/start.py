@@ -1,4 +1,4 @@
-"""The start of a motion, checked: a `Start` that exists is right."""
+"""The checked start of a motion: who makes a `Start` has had its arguments checked."""
 
 from typing import Any, NamedTuple
 

@@ -362,9 +362,9 @@ def test_pictures_of_many_bodies_show_those_that_move_most():
     assert legend(axes["gaps [m]"]) == ("6 of 8", [f"contact {i}" for i in range(3, 9)])
     assert len(axes["gaps [m]"].lines[0].get_xdata()) == 5 + 2  # contact 3, 2 events
     assert [line.get_label() for line in axes["energy [J]"].lines[:3]] == [
-        *("T + V − min V", "T", "contacts took")
+        *("T + V − min V", "T", "contacts absorbed")
     ]
-    assert len(axes["energy [J]"].lines) == 3  # friction took 1e-16 J
+    assert len(axes["energy [J]"].lines) == 3  # friction absorbed 1e-16 J
     chosen = ji.plot.motion(found, system=system, bodies=[0])
     one = {x.get_ylabel(): x for x in chosen.axes}
     assert legend(one["coordinates [m]"]) == ("", ["x1", "y1"])
@@ -442,5 +442,5 @@ def test_phase_portrait_of_what_moves():
 
 def test_report_of_a_motion():
     text = str(rocked()[1])
-    assert "the contacts took 0.5 J" in text
+    assert "the contacts absorbed 0.5 J" in text
     assert "friction" not in text.splitlines()[3]
