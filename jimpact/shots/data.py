@@ -629,9 +629,13 @@ def _as_sigma(
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
         sigma = sigma[None, :]
     if sigma.shape not in ((), measured.shape):
+        advice = ""
+        if sigma.shape == measured.shape[1:]:
+            repeated = f"numpy.tile({name}, ({len(measured)}, 1))"
+            advice = f" One for each coordinate: {repeated}."
         raise ValueError(
             f"Argument `{name}` must be a scalar or have shape {measured.shape} like "
-            f"`post`, but has shape {tuple(sigma.shape)}."
+            f"`post`, but has shape {tuple(sigma.shape)}.{advice}"
         )
     # the error of a value that was not measured does not matter
     known = np.where(measured, np.asarray(sigma), 1.0)

@@ -173,6 +173,7 @@ def test_files_that_cannot_be_read(tmp_path):
         ({"pre": [1.0, 0.0], "post": [np.nan, np.nan]}, r"must hold a measured value"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "sigma": [0.1, 0.0]}, r"`sigma` must lie in \(0, inf\)"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "sigma": [0.1] * 3}, r"`sigma` must be a scalar or have shape"),
+        ({"pre": [[1.0, 0.0]] * 3, "post": [[0.0, 1.0]] * 3, "sigma": [0.1] * 2}, r"numpy\.tile\(sigma, \(3, 1\)\)"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "shots": ["a", "b"]}, r"`shots` must have 1 labels"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "units": ["m/s", "m"]}, r"`units` must have 2 entries"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": []}, r"`scenes` must have one scene per shot"),
