@@ -283,6 +283,10 @@ class Body(eqx.Module):
         """
         return [[curve] for curve in self.outlines(q, point)]
 
+    def shadows(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """Curves (k, 2) [m] of the shadows at q; none but of bodies in space."""
+        return []
+
     @property
     def names(self) -> tuple[str, ...]:
         """Coordinates of q by name and unit, "x [m]", for pictures; (): nobody named

@@ -83,6 +83,29 @@ class Shape(NamedTuple):
         return self.size == 1
 
 
+class _BodyAt(NamedTuple):
+    """A body of points (P, d) [m] with a `rim` [m] that is to be drawn.
+
+    `at` is its configuration, place of the centre of mass first; `turn` (d, d) is R.
+    """
+
+    shape: Shape
+    points: np.ndarray
+    rim: float
+    at: np.ndarray
+    turn: np.ndarray
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Point (d,) [m] halfway between the first and the last one."""
+        return 0.5 * (self.points[0] + self.points[-1])
+
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """Points (.., d) of the body in the room [m]."""
+        place = self.at[: len(self.turn)]
+        return place + points @ self.turn.T
+
+
 class Placed(NamedTuple):
     """Orientations R and points of b bodies in space: `x + R c` for each point c of a
     body.
@@ -526,9 +549,7 @@ class RigidBodies(Body):
 
     @property
     def floors(self) -> list[tuple[float, float]]:
-        """(angle, offset) of the planes; in space outlines have a shadow on the first
-        one.
-        """
+        """(angle, offset) of the planes; in space none: `shadows` show the first."""
         if self.dimension == 3:
             return []
         return [
@@ -536,13 +557,26 @@ class RigidBodies(Body):
         ]
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Curves (k, 2) [m] of all bodies at q; in space projected, with a shadow on a
-        plane.
-        """
+        """Curves (k, 2) [m] of all bodies at q; in space projected."""
         return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
         """Curves (k, 2) [m] at q by body, see `outlines`; `point` is not used."""
+        if self.dimension == 2:
+            draw = self._plane_curves
+        else:
+            draw = self._projected_curves
+        return [draw(body) for body in self._bodies_at(q)]
+
+    def shadows(self, q: np.ndarray) -> list[np.ndarray]:
+        """Projected shadows (k, 2) [m] on the first plane at q; none in the plane."""
+        if self.dimension == 2:
+            return []
+        curves = [self._space_curve(body) for body in self._bodies_at(q)]
+        return [self.shadow(curve) for curve in curves]
+
+    def _bodies_at(self, q: np.ndarray) -> list[_BodyAt]:
+        """The bodies at q, for pictures."""
         at = self.all_bodies(jnp.asarray(q, self.points.dtype))
         each = zip(
             self.shapes,
@@ -551,70 +585,49 @@ class RigidBodies(Body):
             np.asarray(at),
             np.asarray(self.turns(at)),
         )
-        if self.dimension == 2:
-            draw = self._plane_curves
-        else:
-            draw = self._space_curves
         return [
-            draw(shape, np.asarray(points)[: shape.size], float(rim), at, turn)
+            _BodyAt(shape, np.asarray(points)[: shape.size], float(rim), at, turn)
             for shape, points, rim, at, turn in each
         ]
 
-    def _plane_curves(
-        self,
-        shape: Shape,
-        points: np.ndarray,
-        rim: float,
-        at: np.ndarray,
-        turn: np.ndarray,
-    ) -> list[np.ndarray]:
+    def _plane_curves(self, body: _BodyAt) -> list[np.ndarray]:
         """Curves of a disc and one of its radii, of a polygon, or of a rod between two
         discs.
-
-        The body, of points (P, 2) [m] with a `rim` [m], is at `at` (x, y, theta), R =
-        `turn`.
         """
-        place = at[:-1]
-        if shape.is_round:
+        if body.shape.is_round:
             spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-            return [place + (rim * spoke + points[0]) @ turn.T]
-        ends = place + points @ turn.T
-        if shape.faces:
+            return [body.placed(body.rim * spoke + body.points[0])]
+        ends = body.placed(body.points)
+        if body.shape.faces:
             return [np.concatenate([ends, ends[[0]]])]
-        return [ends, *(end + rim * CIRCLE for end in ends)]
+        return [ends, *(end + body.rim * CIRCLE for end in ends)]
 
-    def _space_curves(
-        self,
-        shape: Shape,
-        points: np.ndarray,
-        rim: float,
-        at: np.ndarray,
-        turn: np.ndarray,
-    ) -> list[np.ndarray]:
-        """Projected curves, with shadows: a ball and two great circles, edges of a box,
-        or a rod.
+    def _space_curve(self, body: _BodyAt) -> np.ndarray:
+        """Curve (k, 3) [m]: two great circles of a ball, edges of a box, or a rod."""
+        if body.shape.is_round:
+            flat = body.rim * np.insert(CIRCLE, 2, 0.0, axis=1)
+            upright = np.roll(flat, 1, axis=1)
+            return body.placed(body.middle + np.concatenate([flat, upright]))
+        if body.shape.faces:
+            outward = np.sign(body.points - body.middle)
+            corners = body.points + body.rim * outward
+            return body.placed(corners[_EDGES])
+        return body.placed(body.points)
 
-        The body, of points (P, 3) [m] with a `rim` [m], has its centre of mass at `at`,
-        R = `turn`.
+    def _projected_curves(self, body: _BodyAt) -> list[np.ndarray]:
+        """`_space_curve` projected (k, 2) [m], and the outlines of a ball, or of the
+        balls at the ends of a rod.
         """
-        middle = 0.5 * (points[0] + points[-1])
-        curve = points
-        if shape.is_round:
-            flat = np.insert(CIRCLE, 2, 0.0, axis=1)
-            curve = middle + rim * np.concatenate([flat, np.roll(flat, 1, axis=1)])
-        elif shape.faces:
-            curve = (points + rim * np.sign(points - middle))[_EDGES]
-        place = place_of(at)
-        drawn = self.with_shadow(place + curve @ turn.T)
-        if shape.is_round:
-            return [*drawn, projected(place + turn @ middle) + rim * CIRCLE]
-        if shape.faces:
-            return drawn
-        return [*drawn, *(end + rim * CIRCLE for end in drawn[0])]
+        curve = projected(self._space_curve(body))
+        circle = body.rim * CIRCLE
+        if body.shape.is_round:
+            return [curve, projected(body.placed(body.middle)) + circle]
+        if body.shape.faces:
+            return [curve]
+        return [curve, *(end + circle for end in curve)]
 
-    def with_shadow(self, curve: np.ndarray) -> list[np.ndarray]:
-        """Projections (k, 2) of a curve x (k, 3) [m], and of its shadow on the first
-        plane.
+    def shadow(self, curve: np.ndarray) -> np.ndarray:
+        """Projection (k, 2) of the shadow of a curve x (k, 3) [m] on the first plane.
 
         Equation: the shadow is `x - (n . x - c) n`; without planes on z = 0.
         """
@@ -624,8 +637,7 @@ class RigidBodies(Body):
             plane = np.array([0.0, 0, 1, 0])
         *normal, distance = plane
         height = curve @ normal - distance
-        shadow = curve - np.outer(height, normal)
-        return [projected(curve), projected(shadow)]
+        return projected(curve - np.outer(height, normal))
 
 
 class RigidBody(RigidBodies):

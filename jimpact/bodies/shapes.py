@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.bodies.base import CIRCLE, lengths, number, positive, positives
+from jimpact.bodies.base import CIRCLE, lengths, number, positive, positives, projected
 from jimpact.bodies.rigid import (
     ContactPoints,
     RigidBody,
@@ -594,9 +594,15 @@ class Coin(_SpatialBody):
         return jnp.minimum(length, s - FLAT)
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """Projected curves (k, 2) [m] at q: both rims, a diameter of the upper one, and
-        shadows.
-        """
+        """Projected curves (k, 2) [m] at q: both rims, a diameter of the upper one."""
+        return [[projected(curve) for curve in self._space_curves(q)]]
+
+    def shadows(self, q: np.ndarray) -> list[np.ndarray]:
+        """Projected shadows (k, 2) [m] of the rims and of the diameter at q."""
+        return [self.shadow(curve) for curve in self._space_curves(q)]
+
+    def _space_curves(self, q: np.ndarray) -> list[np.ndarray]:
+        """Curves (k, 3) [m] at q: both rims, and a diameter of the upper one."""
         corners = self.points.shape[1] // 2
         around = np.linspace(0, 2 * np.pi, corners + 1)
         if corners:
@@ -611,8 +617,7 @@ class Coin(_SpatialBody):
         turn = np.asarray(rotation(quaternion_of(jnp.asarray(q))))
         _, diameter = across.reshape(2, -1, 3)  # of the lower and of the upper rim
         in_body = (*rims, diameter)
-        curves = [place_of(q) + curve @ turn.T for curve in in_body]
-        return [[line for curve in curves for line in self.with_shadow(curve)]]
+        return [place_of(q) + curve @ turn.T for curve in in_body]
 
 
 # -------------------------------------------------------------------------------

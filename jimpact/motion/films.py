@@ -41,7 +41,7 @@ _GIF_LEAST = 2.0
 # [s] Frames last a little longer, because whole milliseconds are cut off the rounded
 # numbers of a GIF; a thousand times more would slow films down.
 _CUT_OFF = 1e-6
-_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
+_PLACE = (0.15, 0.11, 0.81, 0.77)  # of the axes in a film, for all frames
 # [MB] Largest page with its frames. matplotlib's own limit, 20, leaves out the end of a
 # long film.
 _LARGEST_PAGE = 1000
@@ -61,7 +61,7 @@ def animation(
 
     Frames are equally spaced in time, whatever the samples are: between the states of
     the record, those at events included, positions follow cubics with the velocities of
-    the record. Bodies in space are shown in parallel projection, with their shadows.
+    the record. Bodies in space are shown in parallel projection, their shadows in grey.
     What moves with the base moves in the picture. The page holds all frames and has a
     slider; only the icons of its buttons come from the network.
 
@@ -183,7 +183,7 @@ def _frames(
         elif ground.shape[1] == 1:
             ground = np.insert(ground, 0, 0.0, axis=1)
     curves = [
-        [curve + moved for curve in body.outlines(x, point)]
+        [curve + moved for curve in (*body.shadows(x), *body.outlines(x, point))]
         for x, moved in zip(q, ground)
     ]
     digits_that_differ = int(np.ceil(-np.log10(speed / rate)))
@@ -193,7 +193,8 @@ def _frames(
     else:
         slow = f" (speed {speed:g})"
     captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
-    colours = colours_of(body, q[0], point)
+    shadows = [GREY] * len(body.shadows(q[0]))
+    colours = [*shadows, *colours_of(body, q[0], point)]
     return count, _film(body, curves, colours, ground, captions)
 
 
@@ -212,6 +213,8 @@ def _film(
     """
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
+    axes.set_xlabel("[m]")
+    axes.set_ylabel("[m]")
     floors = [plane_of(*floor) for floor in body.floors]
     set_limits(axes, curves, ground, floors)
     lines = [axes.plot([], [], color=colour)[0] for colour in colours]

@@ -536,9 +536,12 @@ def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """Draw a body at its configuration q, and the planes that it stands on."""
     point = POINT * (np.ptp(q) or 1.0)  # radius of a point mass [m]
     curves = body.outlines(q, point)
+    shadows = body.shadows(q)
     floors = [plane_of(*floor) for floor in body.floors]
     origin = np.zeros((1, 2))
-    set_limits(axes, [curves], origin, floors)
+    set_limits(axes, [[*curves, *shadows]], origin, floors)
+    for points in shadows:
+        axes.plot(*points.T, color=GREY, lw=0.8)
     colours = colours_of(body, q, point)
     for points, colour in zip(curves, colours, strict=True):
         axes.plot(*points.T, color=colour)

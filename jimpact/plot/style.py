@@ -157,7 +157,6 @@ def panels_of_laws(
     for axes in panels:
         axes.grid(visible=False, axis="x")
     many = len(laws) > _UPRIGHT
-    laws = [law.replace("lzb", "LZB") for law in laws]
     if many:
         words = laws
     else:

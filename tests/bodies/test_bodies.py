@@ -520,19 +520,22 @@ def test_every_body_can_be_drawn():
     drawn = {
         1: (ji.Polygon([[0, 0], [1, 0], [0, 1]]), np.zeros(3)),
         2: (heap, at),
-        4: (ji.SpatialDimer(0.1, 0.5), np.array([0, 0, 0.5, 1, 0, 0, 0])),
+        3: (ji.SpatialDimer(0.1, 0.5), np.array([0, 0, 0.5, 1, 0, 0, 0])),
     }
-    drawn[3] = (ji.Sphere(0.1), np.array([0, 0, 0.5, 1, 0, 0, 0]))
-    for count, (body, q) in drawn.items():
+    sphere = (ji.Sphere(0.1), np.array([0, 0, 0.5, 1, 0, 0, 0]))
+    for count, (body, q) in (*drawn.items(), (2, sphere)):
         curves = body.outlines(q, 0.01)
         assert len(curves) == count
+        assert len(body.shadows(q)) == (len(q) == 7)
         assert all(curve.ndim == 2 and curve.shape[1] == 2 for curve in curves)
         owners = body.outlines_by_body(q, 0.01)
         assert len(owners) == getattr(body, "count", 1)
         assert sum(map(len, owners)) == count
     np.testing.assert_allclose(heap.floors, [[0.0, 0.0], [1.57, -3.0]], rtol=1e-15)
     box = ji.Box([0.2, 0.2, 0.2])
-    edges, shadow = box.outlines(np.array([0, 0, 1.0, 1, 0, 0, 0]), 0.01)
+    aloft = np.array([0, 0, 1.0, 1, 0, 0, 0])
+    (edges,) = box.outlines(aloft, 0.01)
+    (shadow,) = box.shadows(aloft)
     lengths = np.linalg.norm(np.diff(edges, axis=0), axis=1)
     ends = map(tuple, edges.round(9).tolist())
     assert len({tuple(sorted(x)) for x in itertools.pairwise(ends)}) == 12
