@@ -7,6 +7,7 @@ NaN, by each format's mark.
 
 import csv
 import math
+import warnings
 from array import array
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Iterator, Sequence
@@ -284,13 +285,40 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
     places = values[:, before:].reshape(len(values), len(names), 3)
     lost = (places == 0).all(axis=2)
     places = np.where(lost[:, :, None], np.nan, places)
+    _check_count(path, "NO_OF_FRAMES", (head.get("NO_OF_FRAMES") or [""])[0], values)
     rate = _stated(path, "FREQUENCY", (head.get("FREQUENCY") or [""])[0])
-    if before == 2:
-        t = values[:, before - 1]
-    else:
-        t = None
+    t = _times_of_qualisys(values[:, :before], rate)
     found = dict(zip(names, places.swapaxes(0, 1)))
     return Capture("Qualisys TSV", dict.fromkeys(names, PLACE), found, None, rate, t)
+
+
+def _times_of_qualisys(head: np.ndarray, rate: float | None) -> np.ndarray | None:
+    """Times (T,) [s] by the columns before those of markers, none, one or two.
+
+    The last one holds times; one alone that holds whole numbers, numbers of frames.
+    None where lines have neither, or frames no rate.
+    """
+    count = head.shape[1]
+    if count == 0:
+        return None
+    last = head[:, -1]
+    if count == 2 or (last % 1).any():
+        return last
+    if rate is None:
+        return None
+    return (last - last[0]) / rate
+
+
+def _check_count(path: Path, key: str, cell: str, rows: np.ndarray) -> None:
+    """Warn where a file has not so many frames as its head says in `cell`."""
+    if not is_number(cell) or float(cell) == len(rows):
+        return
+    warnings.warn(
+        f"{path}: {key} is {cell}, but the file has {len(rows)} frames: if it was cut "
+        f"off, or lost lines, times may be wrong.",
+        UserWarning,
+        stacklevel=5,
+    )
 
 
 def _width(cells: Sequence[str]) -> int:
@@ -329,6 +357,7 @@ def _trc(path: Path, lines: Lines) -> Capture:
     names = [x for x in of_markers[HEAD:] if x]
     _check_once(path, names)
     rows = _rows(path, _cells(lines, "\t"), HEAD + 3 * len(names))
+    _check_count(path, "NumFrames", head.get("NumFrames", ""), rows.values)
     frames, times, *_ = rows.values.T
     found = _in_threes(names, _without_head(rows.values))
     unit = _unit(path, "Units", head.get("Units", ""))
@@ -400,6 +429,8 @@ def _optitrack(path: Path, lines: Lines) -> Capture:
         }
     body = _rows(path, rows, len(axes))
     values = body.values
+    exported = "Total Exported Frames"
+    _check_count(path, exported, head.get(exported, ""), values)
     order = {
         x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()
     }

@@ -124,7 +124,7 @@ def test_places_units_and_times_of_motion_capture(tmp_path, kind):
     for more, words in (
         ({"rate": 100}, "200"),
         ({"time": "Time"}, "`time`"),
-        ({"unit": "px"}, ""),
+        ({"unit": "px"}, "px"),
     ):
         with pytest.raises(ValueError, match=words):
             ji.tracks.read(path, "ball z", **(unit | more))
@@ -328,7 +328,8 @@ def test_a_line_of_units_that_contradicts_the_argument_is_refused(tmp_path):
 def test_markers_that_were_lost_in_frames_of_empty_cells(tmp_path, end):
     lost = "\t" * 5
     rows = [lost, f"{ROWS[0]}\t{EDGE[0]}", lost, f"{ROWS[2]}\t{EDGE[2]}"]
-    path = table(tmp_path, QUALISYS + "".join(f"{x}{end}\n" for x in rows))
+    head = QUALISYS.replace("FRAMES\t3", "FRAMES\t4")
+    path = table(tmp_path, head + "".join(f"{x}{end}\n" for x in rows))
     t, q = ji.tracks.read(path, ["ball z", "edge x"], unit="mm")
     seen = np.isfinite(q).all(axis=1)
     np.testing.assert_allclose(t[seen], [1 / 200, 3 / 200])
@@ -338,7 +339,8 @@ def test_markers_that_were_lost_in_frames_of_empty_cells(tmp_path, end):
 def test_a_last_marker_that_is_lost_in_the_first_frame_moves_no_column(tmp_path):
     names = "\t".join(f"{m} {a}" for m in ("ball", "edge") for a in "XYZ")
     rows = f"1\t0.0\t{ROWS[0]}\t\t\t\n2\t0.005\t{ROWS[1]}\t{EDGE[2]}\n"
-    path = table(tmp_path, f"{QUALISYS}Frame\tTime\t{names}\n{rows}")
+    head = QUALISYS.replace("FRAMES\t3", "FRAMES\t2")
+    path = table(tmp_path, f"{head}Frame\tTime\t{names}\n{rows}")
     t, q = ji.tracks.read(path, ["ball z", "edge x"], unit="mm")
     np.testing.assert_allclose(t, [0.0, 0.005])
     np.testing.assert_allclose(q, [[0.30025, np.nan], [0.2905, 0.014]])
@@ -348,3 +350,31 @@ def test_rows_with_more_cells_than_the_head_of_motion_capture_are_refused(tmp_pa
     path = table(tmp_path, trc().replace(f"{ROWS[2]}\t", f"{ROWS[2]}\t7.0\t"))
     with pytest.raises(ValueError, match=r"line 9: .*at most 8 cells"):
         ji.tracks.read(path, "ball z")
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (qualisys(True).replace("NO_OF_FRAMES\t3", "NO_OF_FRAMES\t7"), "NO_OF_FRAMES"),
+        (trc().replace("\t200.00\t3\t2", "\t200.00\t7\t2"), "NumFrames"),
+        (
+            OPTITRACK.replace(
+                ",Rotation Type", ",Total Exported Frames,7,Rotation Type"
+            ),
+            "Total Exported Frames",
+        ),
+    ],
+)
+def test_a_file_with_fewer_frames_than_it_states_is_warned_of(tmp_path, text, key):
+    columns = ["edge x"]
+    unit = {"unit": "mm"} if key == "NO_OF_FRAMES" else {}
+    with pytest.warns(UserWarning, match=f"{key} is 7, but the file has 3 frames"):
+        ji.tracks.read(written(tmp_path, text), columns=columns, **unit)
+
+
+def test_frames_of_a_qualisys_file_that_jump_keep_their_times(tmp_path):
+    """A column of frames alone: the lost one has no line."""
+    rows = [f"{k}\t{a}\t{b}" for k, a, b in zip((4, 5, 8), ROWS, EDGE)]
+    path = written(tmp_path, QUALISYS + "\n".join(rows) + "\n")
+    t, _ = ji.tracks.read(path, columns=["ball x"], unit="mm")
+    np.testing.assert_allclose(t, [0.0, 0.005, 0.02], rtol=1e-12)
