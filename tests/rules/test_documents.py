@@ -191,6 +191,13 @@ def test_code_of_pages_fits_the_column():
             assert not long, (path.name, long)
 
 
+def test_no_line_of_a_page_is_a_comment():
+    """A line that begins with % is left out of the site: 5 % that breaks there, too."""
+    for path in DOCS:
+        text = re.sub(r"^```.*?^```", "", path.read_text("utf-8"), flags=re.M | re.S)
+        assert not re.search(r"^ *%", text, re.M), path.name
+
+
 def test_docs_name_what_exists():
     """Every `ji.name` of the texts is a public name; every path a file."""
     for path in [ROOT / "README.md", *DOCS]:
