@@ -455,16 +455,17 @@ def _shots(fit: "Fit") -> list[str]:
         which = "coord"
     else:
         which = "body"
-    head = f"{'shot':>8s} {which:>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
-    lines = [head + common_unit]
     shots, bodies = data.pre.shape
+    shown = max(1, _VELOCITIES_SHOWN // bodies)
+    wide = max(8, *map(len, data.shots[:shown]))
+    columns = f"{which:>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
+    lines = [f"{'shot':>{wide}s} {columns}{common_unit}"]
     before = np.asarray(data.pre, float)
     measured = np.asarray(data.post, float)
     sizes = np.abs(fit.predicted)
     largest = sizes.max(axis=1, keepdims=True)
     is_rounding = np.abs(fit.predicted) <= _ROUNDING * largest
     fitted = np.where(is_rounding, 0.0, fit.predicted)
-    shown = max(1, _VELOCITIES_SHOWN // bodies)
     for k, i in np.ndindex(*before[:shown].shape):
         if i == 0:
             label = data.shots[k]
@@ -479,7 +480,7 @@ def _shots(fit: "Fit") -> list[str]:
         else:
             value = formatted(measured[k, i], ".6g")
         pre, law = (formatted(x[k, i], ">12.6g") for x in (before, fitted))
-        row = f"{label:>8s} {i + 1:>5d} {pre} {value:>12s} {law}"
+        row = f"{label:>{wide}s} {i + 1:>5d} {pre} {value:>12s} {law}"
         if mixed:
             unit = f" {data.units[i]}"
         else:

@@ -444,3 +444,15 @@ def test_report_of_a_motion():
     text = str(rocked()[1])
     assert "the contacts absorbed 0.5 J" in text
     assert "friction" not in text.splitlines()[3]
+
+
+def test_columns_of_shots_with_long_labels_are_aligned():
+    labels = ["the first drop of all", "b"]
+    pair = ji.chain([1.0, 1.0])
+    pre, post = [[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]]
+    data = ji.Experiments(pre, post, 0.02, shots=labels)
+    lines = str(ji.fit(ji.Newton(0.5), pair, data)).splitlines()
+    head, *rows = lines[-5:]
+    end = head.index("measured") + len("measured")
+    for row, value in zip(rows, ("0.3", "0.7", "0.6", "1.4"), strict=True):
+        assert row[:end].endswith(value)
