@@ -43,7 +43,7 @@ ALTERNATING = 10.0
 # Share of the flights on both sides that flights within one contact last at most. Three
 # times more: any impacts are one.
 WITHIN = 0.3
-# Share of all changes of velocity, by jumps and in the flight between, that two pushes
+# Share of all changes of velocity, by jumps and in flights between, that the pushes
 # of one contact leave at least; two bounces leave a third. Half of it: bounces pass.
 ONWARD = 0.5
 # Contact that a finding names, in the time from the first to the last of its pushes:
@@ -389,38 +389,47 @@ def _of_sizes(arcs: Arcs) -> list[str]:
 
 def _of_lasting_contacts(arcs: Arcs, step: float) -> list[str]:
     """Findings of impacts that push one after the other, as a spring does while it is
-    pressed. `step`: from frame to frame [s].
-
-    Flights between them last less than WITHIN of those on both sides. Of bounces the
-    velocity turns back in the flights between; here two impacts leave ONWARD of all
-    changes or more.
+    pressed: the longest runs of them. `step`: from frame to frame [s].
     """
-    pre, post = arcs.velocities()
     at = arcs.instants_of_impacts
-    begin, arriving = neighbours(pre)
-    leaving, end = neighbours(post)
-    changes = [leaving - begin, arriving - leaving, end - arriving]
-    path = sum(np.linalg.norm(change, axis=1) for change in changes)
-    onward = np.linalg.norm(end - begin, axis=1) > ONWARD * path
     found = []
     first = 0
-    for k in range(1, len(at) + 1):
-        if k < len(at) and onward[k - 1]:
-            continue
-        last = k - 1
-        lasting = at[last] - at[first]
-        outer = min(
-            at[first] - arcs.instants[first], arcs.instants[last + 2] - at[last]
-        )
-        if last > first and lasting < WITHIN * outer:
+    while first < len(at):
+        lasts = range(len(at) - 1, first, -1)
+        last = next((k for k in lasts if _is_one_contact(arcs, first, k)), first)
+        if last > first:
+            lasting = at[last] - at[first]
             contact = WHOLE_CONTACT * lasting + 2 * step
             found.append(
                 f"Impacts {first + 1} to {last + 1} are pushes within {lasting:.2g} s: "
                 f"perhaps one contact that lasts, as of a spring or magnets. With "
                 f"contact={contact:.2g} it is one impact."
             )
-        first = k
+        first = last + 1
     return found
+
+
+def _is_one_contact(arcs: Arcs, first: int, last: int) -> bool:
+    """True of a run of impacts that may be pushes of one contact.
+
+    It lasts less than WITHIN of the flights on both sides. Of bounces the velocity
+    turns back in the flights between; here the whole run leaves ONWARD of the changes
+    of velocity, at impacts and between them, or more.
+    """
+    at = arcs.instants_of_impacts
+    lasting = at[last] - at[first]
+    flight_before = at[first] - arcs.instants[first]
+    flight_after = arcs.instants[last + 2] - at[last]
+    if lasting >= WITHIN * min(flight_before, flight_after):
+        return False
+    pre, post = arcs.velocities()
+    run = slice(first, last + 1)
+    leaving = post[first:last]
+    arriving = pre[first + 1 : last + 1]
+    at_impacts = np.linalg.norm(post[run] - pre[run], axis=1)
+    in_flights = np.linalg.norm(arriving - leaving, axis=1)
+    path = at_impacts.sum() + in_flights.sum()
+    return bool(np.linalg.norm(post[last] - pre[first]) > ONWARD * path)
 
 
 def _of_times(arcs: Arcs) -> list[str]:

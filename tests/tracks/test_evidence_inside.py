@@ -147,6 +147,21 @@ def test_a_spring_that_is_pressed_is_told_to_be_one_contact():
     assert np.abs(errors(impact, [0.6, -0.4], [-0.4, 0.6])).max() < 3.5
 
 
+@pytest.mark.parametrize(
+    ("changes", "lasts"),
+    [((-0.3, 0.25, -1.2), True), ((-1.4, 1.3, -1.2), False)],
+)
+def test_a_run_of_pushes_is_one_contact_by_its_whole_change_of_velocity(changes, lasts):
+    """The first two pushes take one another back; of bounces all do."""
+    t = np.arange(1000) / 500
+    at = (1.0, 1.05, 1.1)
+    pushed = (dv * np.maximum(t - when, 0) for dv, when in zip(changes, at))
+    noise = 2e-5 * np.random.default_rng(14).normal(size=t.size)
+    track = ji.tracks.find_impacts(t, t + sum(pushed) + noise)
+    assert len(track.impacts) == 3
+    assert any("contact=" in line for line in track.warnings) == lasts
+
+
 def test_frames_lost_at_the_impact_do_not_bound_its_instant():
     rng = np.random.default_rng(3)
     z = []
