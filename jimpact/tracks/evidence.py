@@ -20,11 +20,11 @@ from jimpact.tracks.division import price
 from jimpact.tracks.flight import Flight
 from jimpact.tracks.frames import Frames, least_noise, neighbours
 from jimpact.tracks.likelihood import (
-    LEAST_SAVED,
     SHARES,
     Coordinate,
     Likelihood,
     Likely,
+    price_of_waves,
     residual_squares,
 )
 from jimpact.tracks.waves import Errors, Wave
@@ -425,8 +425,8 @@ class _Task:
 def _cost(frames: Frames, verdict: Verdict) -> float:
     """Cost of all flights: of residuals, prices of flights and of waves."""
     costs = FlightCosts(frames, verdict.flight, verdict.errors).of(verdict.flights)
-    waves = 2 * np.log(len(frames.t)) + LEAST_SAVED
-    of_waves = waves * verdict.errors.number_of_waves
+    counts = map(len, verdict.errors.waves)
+    of_waves = sum(price_of_waves(len(frames.t), count) for count in counts)
     least = np.minimum(costs.line, costs.parabola)
     of_flights = price(*frames.q.shape) * len(verdict.flights)
     return float(least.sum() + of_waves) + of_flights

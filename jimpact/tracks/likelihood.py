@@ -5,6 +5,7 @@ in flights. Slow waves are looked for by means of frames, quick ones by pieces o
 flights, as many frames take long.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -50,6 +51,17 @@ SHOWN = 2.5
 # Cost that waves must save: BIC of their size and time, and what one good track in a
 # hundred saves.
 LEAST_SAVED = 4.0
+
+
+def price_of_waves(frames: int, count: int) -> float:
+    """Cost that so many waves of a coordinate of so many frames must save.
+
+    Those beside others LEAST_SAVED only: where the first ones are, others are likely,
+    and without them errors of velocities would be too small.
+    """
+    if not count:
+        return 0.0
+    return 2 * math.log(frames) + count * LEAST_SAVED
 
 
 @dataclass(frozen=True)
@@ -298,7 +310,7 @@ class Likelihood:
         found = [self._beside(waves) for waves in tried if waves]
         paid = white.cost
         for likely in found:
-            cost = likely.cost + self.price_of_waves(len(likely.waves))
+            cost = likely.cost + price_of_waves(len(self.some.t), len(likely.waves))
             if cost < paid:
                 paid = cost
                 best = likely
@@ -365,16 +377,6 @@ class Likelihood:
             return shown
         return given
 
-    def price_of_waves(self, count: int) -> float:
-        """Cost that so many waves must save.
-
-        Those beside others LEAST_SAVED only: where the first ones are, others are
-        likely, and without them errors of velocities would be too small.
-        """
-        if not count:
-            return 0.0
-        return 2 * float(np.log(len(self.some.t))) + count * LEAST_SAVED
-
     def shows_waves(self, sigma: float) -> bool:
         """True if means of 4, 16, 64, .. frames in a row are larger than white errors
         make them.
@@ -437,8 +439,8 @@ class Likelihood:
                 finer = Wave(coarse.size, coarse.time * factor)
                 here = self._best_size(finer, beside)
                 best = min(best, here)
-        price = self.price_of_waves(len(best.waves))
-        price -= self.price_of_waves(len(beside))
+        price = price_of_waves(len(self.some.t), len(best.waves))
+        price -= price_of_waves(len(self.some.t), len(beside))
         if without.cost - best.cost < price:
             return ()
         return best.waves[:1]
@@ -502,7 +504,7 @@ class Likelihood:
             float(cost),
             sigma,
             tuple(wave.scaled(sigma) for wave in waves),
-            float(evidence) + self.price_of_waves(len(waves)),
+            float(evidence) + price_of_waves(len(self.some.t), len(waves)),
         )
 
     def _beside(self, waves: tuple[Wave, ...]) -> Likely:
