@@ -83,6 +83,16 @@ def unit(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n ..."]:
     return identity.reshape(*matrix.shape[:2], *axes_of_batch)
 
 
+def unit_outside(
+    matrix: Float[Array, "n n"], held: Bool[Array, " n"]
+) -> Float[Array, "n n"]:
+    """The matrix in the rows and columns `held`, the unit matrix elsewhere."""
+    in_row = held[:, None]
+    in_column = held[None, :]
+    both = in_row & in_column
+    return jnp.where(both, matrix, unit(matrix))
+
+
 def times(
     matrix: Float[Array, "a b *#B"], vector: Float[Array, "b *#B"]
 ) -> Float[Array, "a *#B"]:
