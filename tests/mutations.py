@@ -115,7 +115,7 @@ MUTATIONS = [
     Mutation("the median deviation taken for sigma", "", "MEDIAN = 1.4826", "MEDIAN = 1.0", ("test_fit.py::test_the_scale_of_robust_losses_is_that_of_normal_errors",)),
     Mutation("a hundred times the rounding of velocities", "precision", "4 * eps", "400 * eps", ("test_seams.py::test_ten_times_the_rounding_is_an_impact",)),
     Mutation("degrees of freedom of the F test swapped", "_f_test", "fdtrc(more, freedom, ratio)", "fdtrc(freedom, more, ratio)", ("test_selection.py::test_the_need_of_a_dependence_on_speed_is_tested",)),
-    Mutation("moments of inertia of a box with 1/10", "Box.__init__", "(jnp.sum(sizes ** 2) - sizes ** 2) / 12", "(jnp.sum(sizes ** 2) - sizes ** 2) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),
+    Mutation("moments of inertia of a box with 1/10", "Box.__init__", "(jnp.sum(squares) - squares) / 12", "(jnp.sum(squares) - squares) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),
     Mutation("a rod's inertia about its end", "_dimer", "rod * length ** 2 / 12", "rod * length ** 2 / 3", ("test_scenes.py",)),
     Mutation("sign of the Coriolis terms", "Body.inertial_force", "0.5 * gradient", "-0.5 * gradient", ("test_bodies_in_motion.py::test_inertial_forces_keep_the_energy",)),
     Mutation("velocities of boxes in the axes of space", "RigidBodies.contact_jacobian", "jnp.swapaxes(self.turns(at), -1, -2)", "self.turns(at)", ("test_bodies.py::test_contacts_of_a_box",)),

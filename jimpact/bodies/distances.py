@@ -278,7 +278,7 @@ def changed_places(
     direction = _CUT + (angle_of_normal - _CUT) % turn
     number = jnp.zeros(len(direction), jnp.int32)
     # seen from the second polygon, the direction between both is turned by pi
-    directions = (direction + 0.0, direction + np.pi)
+    directions = (direction, direction + np.pi)
     facing_sides_of_both = (facing.first, facing.second)
     both = zip(polygons, angles, counts, facing_sides_of_both, directions)
     for corners, angle, count, side, toward_other in both:
