@@ -179,35 +179,27 @@ class Bodies(RigidBodies):
                 f"Argument `bodies` must be discs, polygons or spheres, not {names}."
             )
         self.masses = _stacked([body.masses[0] for body in bodies])
-        inertias = _alike([body.inertias[0] for body in bodies])
-        self.inertias = _stacked(inertias)
-        self.points = _stacked(_padded(every))
+        inertias = [body.inertias[0] for body in bodies]
+        self.inertias = _stacked(_alike(inertias))
+        points = _padded(every)
+        self.points = _stacked(points)
         self.rims = _stacked([body.rims[0] for body in every])
-        self.planes = as_planes(planes, d).astype(self.points.dtype)
+        of_planes = as_planes(planes, d)
+        self.planes = of_planes.astype(self.points.dtype)
         self.room = 0
         self.pairs = None
         self.crowd = 0
         entries = 3 if d == 2 else 7
-        self.places = as_float_array("places", places).reshape(-1, entries)
+        of_fixed = as_float_array("places", places)
+        self.places = of_fixed.reshape(-1, entries)
         if many:
-            if d == 3:
-                kinds = "spheres"
-            elif self.points.shape[1] == 1:
-                kinds = "discs"
-            else:
-                kinds = "polygons"
             if room is None:
-                self.room = ROOM[kinds] * self.count
+                self.room = self._usual_room(d)
             else:
                 self.room = as_whole("room", room, 1)
             self.crowd = grid.crowd_of_cells(self)
             return
-        size = (len(fixed), self.places.shape[1])
-        check_shape("places", self.places, size, "one for each of `fixed`")
-        check_values("places", self.places)
-        if self.dimension == 3:
-            for place in self.places:
-                unit_quaternion(quaternion_of(place))
+        _check_places(self.places, len(fixed), d)
         self.pairs = _as_pairs(every, self.shapes, len(bodies), d, pairs)
         if not len(self.pairs_in_contact()):
             raise ValueError(
@@ -218,7 +210,20 @@ class Bodies(RigidBodies):
         """True if the grid can find their contacts: discs and polygons, or centred
         spheres.
         """
-        return all(s.centred if d == 3 else s.faces or s.is_round for s in self.shapes)
+        if d == 3:
+            return all(shape.centred for shape in self.shapes)
+        return all(shape.faces or shape.is_round for shape in self.shapes)
+
+    def _usual_room(self, d: int) -> int:
+        """Contacts that may be closed at once, where the argument `room` is None."""
+        _, points, _ = self.points.shape
+        if d == 3:
+            kind = "spheres"
+        elif points == 1:
+            kind = "discs"
+        else:
+            kind = "polygons"
+        return ROOM[kind] * self.count
 
     @property
     def quaternions(self) -> bool:
@@ -234,35 +239,39 @@ class Bodies(RigidBodies):
         """
         if self.pairs is None:
             every_pair = np.triu_indices(self.count, 1)
-            each = np.stack(every_pair, axis=1).astype(np.int32)
+            all_pairs = np.stack(every_pair, axis=1).astype(np.int32)
         else:
             pairs = np.array(self.pairs, np.int32)
-            each = pairs.reshape(-1, 2)
+            all_pairs = pairs.reshape(-1, 2)
         round_bodies = np.array([shape.is_round for shape in self.shapes])
         if round_bodies.all():  # of thousands there are millions of pairs
-            return each, each[:0], each[:0]
-        is_round = round_bodies[each]
-        one_round = is_round.sum(axis=1) == 1
-        mixed = each[one_round]
+            none = all_pairs[:0]
+            return all_pairs, none, none
+        is_round = round_bodies[all_pairs]
+        rounds = is_round.sum(axis=1)
+        one_round = rounds == 1
+        mixed = all_pairs[one_round]
         first_is_round, _ = is_round[one_round].T
         swapped = mixed[:, ::-1]
         mixed = np.where(first_is_round[:, None], mixed, swapped)
-        both_round = each[is_round.all(axis=1)]
-        both_faces = each[~is_round.any(axis=1)]
+        both_round = all_pairs[rounds == 2]
+        both_faces = all_pairs[rounds == 0]
         return both_round, mixed, both_faces
 
     def pairs_in_contact(self) -> np.ndarray:
         """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
         discs, mixed, faces = self._kinds
         two_each = np.repeat(faces, 2, axis=0)
-        return np.concatenate([super().pairs_in_contact(), discs, mixed, two_each])
+        on_planes = super().pairs_in_contact()
+        return np.concatenate([on_planes, discs, mixed, two_each])
 
     def all_bodies(self, q: jax.Array) -> jax.Array:
         """Coordinates (b, ..) of each body, the fixed ones last."""
         if not len(self.places):
             return self.of_bodies(q)
+        moving = self.of_bodies(q)
         places = self.places.astype(q.dtype)
-        return jnp.concatenate([self.of_bodies(q), places])
+        return jnp.concatenate([moving, places])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps (m,), points and normals (m, ..) at q, in the order of
@@ -272,30 +281,31 @@ class Bodies(RigidBodies):
         placed = self.placed(q)
         rims = self.rims
         points = placed.points
-        parts = [self.on_planes(placed.points)]
+        parts = [self.on_planes(points)]
         discs, mixed, faces = self._kinds
         if len(discs):
             i, j = discs.T
             first = points[i, 0]
             second = points[j, 0]
-            parts.append(round_on_round(first, second, rims[i], rims[j]))
+            discs_in_contact = round_on_round(first, second, rims[i], rims[j])
+            parts.append(discs_in_contact)
         if len(mixed):
-            parts.append(self._round_on_faces(placed, *mixed.T))
+            i, j = mixed.T
+            parts.append(self._round_on_faces(placed, i, j))
         if len(faces):
             i, j = faces.T
             a = points[i]
             b = points[j]
             facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # indices of sides
             counts = self._counts
-            angles = self.all_bodies(q)[
-                :, -1
-            ]  # q = (x, y, theta) of discs and polygons
-            at = (angles[i], angles[j])
+            coordinates = self.all_bodies(q)  # (x, y, theta) of discs and polygons
+            theta = coordinates[:, -1]
+            angles = (theta[i], theta[j])
             sizes = (counts[i], counts[j])
             # which of the two contacts of a pair comes first, so that one keeps its
             # place where a body rolls over a corner and another side faces the other
             # body
-            swapped = changed_places((a, b), at, sizes, facing)
+            swapped = changed_places((a, b), angles, sizes, facing)
             two_each = polygon_on_polygon(a, b, facing, swapped)  # (g, 2, ..)
             flat = (x.reshape(-1, *x.shape[2:]) for x in two_each)
             parts.append(ContactPoints(*flat))
@@ -319,18 +329,21 @@ class Bodies(RigidBodies):
         points = placed.points
         turns = placed.turns
         rims = self.rims
+        p = points[i, 0]
         if self.dimension == 2:
-            return disc_on_polygon(points[i, 0], rims[i], points[j])
+            return disc_on_polygon(p, rims[i], points[j])
+        turn = turns[j]
         middle = 0.5 * (points[j, 0] + points[j, -1])
-        diagonal = self.points[j, -1] - self.points[j, 0]
+        corners = self.points[j]
+        diagonal = corners[:, -1] - corners[:, 0]
         half = 0.5 * diagonal  # sizes of the boxes
         # in their axes
-        to_axes = jnp.swapaxes(turns[j], 1, 2)
-        from_middle = times(to_axes, points[i, 0] - middle)
+        to_axes = jnp.swapaxes(turn, 1, 2)
+        from_middle = times(to_axes, p - middle)
         distance, n = from_box(from_middle, half)
-        normal = times(turns[j], n)
+        normal = times(turn, n)
         away = distance - rims[j]
-        point = points[i, 0] - away[:, None] * normal
+        point = p - away[:, None] * normal
         return ContactPoints(away - rims[i], point, normal)
 
     @full_precision
@@ -350,19 +363,23 @@ class Bodies(RigidBodies):
         discs, mixed, faces = self._kinds
         if len(discs):
             i, j = discs.T
-            distance, _ = lengths(points[i, 0] - points[j, 0])
+            apart = points[i, 0] - points[j, 0]
+            distance, _ = lengths(apart)
             margins.append(distance)
         if len(mixed):
             discs_of_mixed, polygons = mixed.T
-            gap = self._round_on_faces(placed, discs_of_mixed, polygons).gap
-            margins.append(gap + self.rims[discs_of_mixed])
-        odd = self._counts[faces].sum(axis=1) % 2 == 1
+            contacts = self._round_on_faces(placed, discs_of_mixed, polygons)
+            margins.append(contacts.gap + self.rims[discs_of_mixed])
+        corners = self._counts[faces].sum(axis=1)
+        odd = corners % 2 == 1
         if odd.any():
             i, j = faces[odd].T
             a = points[i]
             b = points[j]
-            margins.append(margin_of_places((a, b), facing_sides(a, b)))
-        return jnp.min(jnp.concatenate(margins))
+            facing = facing_sides(a, b)
+            margins.append(margin_of_places((a, b), facing))
+        all_margins = jnp.concatenate(margins)
+        return jnp.min(all_margins)
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
@@ -389,14 +406,17 @@ class Bodies(RigidBodies):
         check_choice("plane", plane, range(len(self.planes)))
         turn = number("angle", angle)
         distance = number("along", along)
-        (n_x, n_y, offset) = self.planes[plane]
+        n_x, n_y, offset = self.planes[plane]
         # heights of its points over the centre of mass, along the normal
         x, y = self.points[body].T
         heights = jnp.sin(turn) * x + jnp.cos(turn) * y
-        up = offset + self.rims[body] - jnp.min(heights)
-        place = [n_y * distance + n_x * up, n_y * up - n_x * distance]
+        lowest = jnp.min(heights)
+        up = offset + self.rims[body] - lowest
+        place_x = n_y * distance + n_x * up
+        place_y = n_y * up - n_x * distance
         inclination = jnp.arctan2(-n_x, n_y)
-        return jnp.stack([*place, turn + inclination])
+        theta = turn + inclination
+        return jnp.stack([place_x, place_y, theta])
 
     # ---- many bodies: closed contacts only
 
@@ -406,7 +426,8 @@ class Bodies(RigidBodies):
         planes.
         """
         if self.room:
-            return grid.slots(self) * self.count * grid.stride(self)
+            of_body = grid.slots(self) * self.count
+            return of_body * grid.stride(self)
         return None
 
     @property
@@ -463,7 +484,8 @@ class Bodies(RigidBodies):
         check_shape("q", q, self.mass.shape, "one number per velocity")
         check_values("q", q)
         if below is None:
-            below = _TOUCHING * float(grid.least_radius(self))
+            radius = float(grid.least_radius(self))
+            below = _TOUCHING * radius
         check_values("below", below, low=0.0)
         closed_below = jnp.asarray(below, q.dtype)
         pairs, least = jax.device_get(_active_pairs(self, q, closed_below))
@@ -484,7 +506,8 @@ class Bodies(RigidBodies):
                 f"`room` of `Bodies`), but holds more."
             )
         listed = listed_pairs(pairs, self.mass)
-        moves = listed.directions[:, 0].any(axis=(1, 2))
+        normals = listed.directions[:, 0]
+        moves = normals.any(axis=(1, 2))
         if not moves.all():
             raise ValueError("Argument `q` must hold bodies with different centres.")
         return listed.scene
@@ -495,7 +518,20 @@ def _active_pairs(
     bodies: Bodies, q: jax.Array, below: jax.Array
 ) -> tuple[ActivePairs, jax.Array]:
     """The contacts with gaps up to `below` () [m] at q, and the least gap () [m]."""
-    return bodies.active_pairs(q, q, below), bodies.least_gap(q)
+    closed = bodies.active_pairs(q, q, below)
+    return closed, bodies.least_gap(q)
+
+
+def _check_places(places: jax.Array, fixed: int, d: int) -> None:
+    """Raise a ValueError unless there is a place for each of the `fixed` bodies, in
+    space with a unit quaternion.
+    """
+    _, entries = places.shape
+    check_shape("places", places, (fixed, entries), "one for each of `fixed`")
+    check_values("places", places)
+    if d == 3:
+        for place in places:
+            unit_quaternion(quaternion_of(place))
 
 
 # ------------------------------------------------------------------------------
@@ -513,7 +549,8 @@ def _stacked(rows: Sequence[jax.Array]) -> jax.Array:
 
 def _alike(inertias: Sequence[jax.Array]) -> list[jax.Array]:
     """Moments of inertia, all of them matrices if one is."""
-    if len({inertia.ndim for inertia in inertias}) == 1:
+    dimensions = {inertia.ndim for inertia in inertias}
+    if len(dimensions) == 1:
         return list(inertias)
     return [jnp.diag(x) if x.ndim == 1 else x for x in inertias]
 
@@ -522,12 +559,16 @@ def _padded(bodies: Sequence[RigidBody]) -> list[Any]:
     """Points (P, d) [m] of each body, its last one repeated up to the largest number
     P.
     """
-    most = max(body.points.shape[1] for body in bodies)
-    pad = jnp if is_traced([body.points for body in bodies]) else np
-    return [
-        pad.pad(body.points[0], ((0, most - body.points.shape[1]), (0, 0)), mode="edge")
-        for body in bodies
-    ]
+    points = [body.points[0] for body in bodies]
+    numpy: Any = jnp if is_traced(points) else np
+    largest = max(map(len, points))
+
+    def padded(p: jax.Array) -> Any:
+        """Points (P, d) of one body."""
+        missing = largest - len(p)
+        return numpy.pad(p, ((0, missing), (0, 0)), mode="edge")
+
+    return list(map(padded, points))
 
 
 def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:

@@ -34,7 +34,8 @@ def round_on_round(
     length, n = lengths(a - b)
     gap = length - r - s
     height = s + 0.5 * gap
-    return ContactPoints(gap, b + height[:, None] * n, n)
+    point = b + height[:, None] * n
+    return ContactPoints(gap, point, n)
 
 
 def from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -45,15 +46,18 @@ def from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
     these is positive (negative inside); `|max(|x_i| - half_i, 0)|`, that from an edge
     or corner, elsewhere.
     """
-    signs = jnp.where(x < 0, -1.0, 1.0)
+    negative = x < 0
+    signs = jnp.where(negative, -1.0, 1.0)
     sign = signs.astype(x.dtype)
     beyond = sign * x - half
     face = jnp.argmax(beyond, axis=1)
-    over_face = jnp.sum(beyond > 0, axis=1) < 2
+    faces_passed = jnp.sum(beyond > 0, axis=1)
+    over_face = faces_passed < 2
     length, toward = lengths(jnp.maximum(beyond, 0.0))
     of_face = jax.nn.one_hot(face, 3, dtype=x.dtype)
     n = jnp.where(over_face[:, None], of_face, toward)
-    distance = jnp.where(over_face, jnp.max(beyond, axis=1), length)
+    depth = jnp.max(beyond, axis=1)
+    distance = jnp.where(over_face, depth, length)
     return distance, sign * n
 
 
@@ -67,13 +71,16 @@ def sides(corners: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     Side i goes from corner i to the next one; one without length has the normal 0.
     """
-    side = jnp.roll(corners, -1, axis=-2) - corners
+    following = jnp.roll(corners, -1, axis=-2)
+    side = following - corners
     return side, outward(side)
 
 
 def angle_in_plane(vector: jax.Array) -> jax.Array:
     """Angles (..) [rad] of vectors (.., 2) from the x axis, in (-pi, pi]."""
-    return jnp.arctan2(vector[..., -1], vector[..., 0])
+    x = vector[..., 0]
+    y = vector[..., -1]
+    return jnp.arctan2(y, x)
 
 
 def outward(side: jax.Array) -> jax.Array:
@@ -84,7 +91,9 @@ def outward(side: jax.Array) -> jax.Array:
     x = side[..., 0]
     y = side[..., -1]
     turned = jnp.stack([y, -x], axis=-1)
-    return turned / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    has_length = square > 0
+    positive = jnp.where(has_length, square, 1.0)
+    return turned / jnp.sqrt(positive)
 
 
 def disc_on_polygon(
@@ -96,13 +105,16 @@ def disc_on_polygon(
     Equation: `f = d - r` with the distance d of the middle from the polygon.
     """
     side, normals = sides(corners)
-    heights = _without_points(dot(middle[:, None] - corners, normals), normals)
+    from_corners = middle[:, None] - corners
+    over_lines = dot(from_corners, normals)
+    heights = _without_points(over_lines, normals)
     # outside, its side or one of its ends is the nearest
     nearest = jnp.argmax(heights, axis=1)
     row = np.arange(len(corners))
     at_nearest = (x[row, nearest] for x in (corners, side, normals))
     away, _, n = _from_side(middle, *at_nearest)
-    return ContactPoints(away - rim, middle - away[:, None] * n, n)
+    point = middle - away[:, None] * n
+    return ContactPoints(away - rim, point, n)
 
 
 def _from_side(
@@ -120,15 +132,21 @@ def _from_side(
     from_begin = point - begin
     along = dot(side, from_begin)  # from 0 at the begin to |side|^2 at the end
     slack = PARALLEL * jnp.sqrt(square)
-    beyond = (along < -slack) | (along > square + slack)
+    too_early = along < -slack
+    too_late = along > square + slack
+    beyond = too_early | too_late
     # the nearer one
-    share = jnp.where(along > square, 1.0, 0.0)
+    past_middle = along > square
+    share = jnp.where(past_middle, 1.0, 0.0)
     end = begin + share[..., None] * side
     length, toward = lengths(point - end)
-    distance = jnp.where(beyond, length, dot(n, from_begin))
+    height = dot(n, from_begin)
+    distance = jnp.where(beyond, length, height)
     beyond = beyond[..., None]
-    contact = jnp.where(beyond, 0.5 * (point + end), point)
-    return distance, contact, jnp.where(beyond, toward, n)
+    halfway = 0.5 * (point + end)
+    contact = jnp.where(beyond, halfway, point)
+    normal = jnp.where(beyond, toward, n)
+    return distance, contact, normal
 
 
 def _without_points(heights: jax.Array, normals: jax.Array) -> jax.Array:
@@ -153,7 +171,8 @@ def _at_side(is_chosen: jax.Array, values: jax.Array) -> jax.Array:
     """
     other_axes = [1] * (values.ndim - 3)
     chosen = is_chosen.reshape(*is_chosen.shape, *other_axes)
-    return jnp.sum(jnp.where(chosen, values, 0.0), axis=2)
+    of_chosen = jnp.where(chosen, values, 0.0)
+    return jnp.sum(of_chosen, axis=2)
 
 
 def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
@@ -168,21 +187,24 @@ def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
     _, normals = sides(both)
     # (polygon, pair, corner of the other polygon, side)
     of_other = both[::-1, :, :, None]
-    heights = dot(of_other - both[:, :, None], normals[:, :, None])
-    beyond = _without_points(jnp.min(heights, axis=2), normals)
-    own = jnp.argmax(beyond, axis=2)
-    is_own = jax.nn.one_hot(own, a.shape[1], dtype=bool)
-    n = _at_side(is_own, normals)
+    from_corners = of_other - both[:, :, None]
+    heights = dot(from_corners, normals[:, :, None])
+    lowest = jnp.min(heights, axis=2)
+    beyond = _without_points(lowest, normals)
+    separating = jnp.argmax(beyond, axis=2)
+    count = a.shape[1]
+    is_separating = jax.nn.one_hot(separating, count, dtype=bool)
+    n = _at_side(is_separating, normals)
     # side of the other polygon
     facing = dot(normals[::-1], n[:, :, None])
     opposite = jnp.argmin(facing, axis=2)
     separation = jnp.max(beyond, axis=2)
     of_a, of_b = separation
     by_b = of_b > of_a + PARALLEL  # a side of b separates more
-    own_a, own_b = own
+    separating_a, separating_b = separating
     opposite_b, opposite_a = opposite
-    first = jnp.where(by_b, opposite_a, own_a)
-    second = jnp.where(by_b, own_b, opposite_b)
+    first = jnp.where(by_b, opposite_a, separating_a)
+    second = jnp.where(by_b, separating_b, opposite_b)
     n_a, n_b = n
     normal = jnp.where(by_b[:, None], -n_b, n_a)
     return Facing(first, second, normal)
@@ -207,14 +229,16 @@ def polygon_on_polygon(
     ends = jnp.stack([corners, next_corners], axis=3)
     ends = _at_side(is_facing, ends)  # (body, pair, begin or end, x or y)
     begin = ends[:, :, 0]
-    side = ends[:, :, -1] - begin
+    end = ends[:, :, -1]
+    side = end - begin
     # the ends of each body's side in the order of the contacts, against the other
     # body's side
     both_swapped = jnp.stack([swapped, ~swapped])
     reverse = both_swapped[:, :, None, None]
     reversed_ends = ends[:, :, ::-1]
     ends = jnp.where(reverse, reversed_ends, ends)
-    others = (x[::-1, :, None] for x in (begin, side, outward(side)))
+    n = outward(side)
+    others = (x[::-1, :, None] for x in (begin, side, n))
     gaps, points, normals = _from_side(ends, *others)  # (body, pair, contact, ..)
     gap_a, gap_b = gaps
     point_a, point_b = points
@@ -249,16 +273,21 @@ def changed_places(
         facing: their facing sides.
     """
     angle_of_normal = angle_in_plane(facing.normal)
-    direction = _CUT + (angle_of_normal - _CUT) % (2 * np.pi)
+    angle_of_normal = angle_in_plane(facing.normal)
+    turn = 2 * np.pi
+    direction = _CUT + (angle_of_normal - _CUT) % turn
     number = jnp.zeros(len(direction), jnp.int32)
     # seen from the second polygon, the direction between both is turned by pi
+    directions = (direction, direction + np.pi)
     facing_sides_of_both = (facing.first, facing.second)
-    each = zip(polygons, angles, counts, facing_sides_of_both, (0.0, np.pi))
-    for corners, angle, count, side, half_turn in each:
-        number += jnp.minimum(side, count - 1).astype(jnp.int32)
-        if (count % 2).any():
-            full = _full_turns(corners, side, angle, direction + half_turn)
-            number += jnp.where(count % 2 == 1, full, 0)
+    both = zip(polygons, angles, counts, facing_sides_of_both, directions)
+    for corners, angle, count, side, toward_other in both:
+        last = count - 1
+        number += jnp.int32(jnp.minimum(side, last))
+        is_odd = count % 2 == 1
+        if is_odd.any():
+            full = _full_turns(corners, side, angle, toward_other)
+            number += jnp.where(is_odd, full, 0)
     return number % 2 == 1
 
 
@@ -276,10 +305,13 @@ def _full_turns(
     _, normals = sides(corners)
     angles = angle_in_plane(normals)  # (g, K)
     first = angles[:, 0]
-    facing = angles[np.arange(len(angles)), side]
-    to_first = (first - angle) % (2 * np.pi)
-    phi = angle + to_first + (facing - first) % (2 * np.pi)
-    turns = jnp.round((direction - phi) / (2 * np.pi))
+    row = np.arange(len(angles))
+    facing = angles[row, side]
+    turn = 2 * np.pi
+    to_first = (first - angle) % turn
+    to_facing = (facing - first) % turn
+    phi = angle + to_first + to_facing
+    turns = jnp.round((direction - phi) / turn)
     return turns.astype(jnp.int32)
 
 
@@ -296,9 +328,11 @@ def margin_of_places(
     a, b = polygons
     n = facing.normal[:, None]
     nearest_of_b = jnp.min(dot(b, n), axis=1)
-    distance = nearest_of_b - jnp.max(dot(a, n), axis=1)
+    farthest_of_a = jnp.max(dot(a, n), axis=1)
+    distance = nearest_of_b - farthest_of_a
     cut = jnp.array([[np.cos(_CUT), np.sin(_CUT)]], n.dtype)
-    off = 1 - dot(n[:, 0], cut) - _NEAR_CUT
+    cosine = dot(n[:, 0], cut)
+    off = 1 - cosine - _NEAR_CUT
     return jnp.maximum(off, distance - _TOUCHING)
 
 
@@ -314,15 +348,20 @@ def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactP
     middle_b = b[:, 0]
     discs = round_on_round(middle_a, middle_b, r, s)
     not_swapped = jnp.zeros(len(a), bool)
-    polygons = polygon_on_polygon(a, b, facing_sides(a, b), not_swapped)
+    facing = facing_sides(a, b)
+    polygons = polygon_on_polygon(a, b, facing, not_swapped)
     first_is_disc = r[:, None] > 0
     disc = jnp.where(first_is_disc, middle_a, middle_b)
     polygon = jnp.where(first_is_disc[..., None], b, a)
-    mixed = disc_on_polygon(disc, jnp.maximum(r, s), polygon)
+    radius = jnp.maximum(r, s)
+    mixed = disc_on_polygon(disc, radius, polygon)
     sign = jnp.where(first_is_disc, 1.0, -1.0)
-    mixed = mixed._replace(normal=sign * mixed.normal)
-    any_disc = (r > 0) | (s > 0)
-    both_discs = (r > 0) & (s > 0)
+    toward_first = sign * mixed.normal
+    mixed = mixed._replace(normal=toward_first)
+    a_is_disc = r > 0
+    b_is_disc = s > 0
+    any_disc = a_is_disc | b_is_disc
+    both_discs = a_is_disc & b_is_disc
 
     def chosen(
         of_discs: jax.Array, of_mixed: jax.Array, of_polygons: jax.Array
@@ -330,11 +369,11 @@ def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactP
         """Values (g, 2, ..) by the kind of each pair; those of a disc, (g, ..), are
         repeated.
         """
-        each = [1] * (of_discs.ndim - 1)
-        is_disc = both_discs.reshape(-1, *each)
-        with_disc = jnp.where(is_disc, of_discs, of_mixed)[:, None]
-        with_one_disc = any_disc.reshape(-1, 1, *each)
-        return jnp.where(with_one_disc, with_disc, of_polygons)
+        other_axes = [1] * (of_discs.ndim - 1)
+        is_disc = both_discs.reshape(-1, *other_axes)
+        with_disc = jnp.where(is_disc, of_discs, of_mixed)
+        with_one_disc = any_disc.reshape(-1, 1, *other_axes)
+        return jnp.where(with_one_disc, with_disc[:, None], of_polygons)
 
     kinds = zip(discs, mixed, polygons)
     gap, point, normal = (chosen(*x) for x in kinds)

@@ -96,14 +96,17 @@ def slots(bodies: Pile) -> int:
     """Contacts of a pair of bodies: 1 of discs or spheres; 2 of polygons, the ends of a
     side.
     """
-    return min(2, bodies.points.shape[1])
+    points = bodies.points.shape[1]
+    return min(2, points)
 
 
 def stride(bodies: Pile) -> int:
     """Partners b + w P of a body, by which contacts are numbered: bodies, then planes x
     points.
     """
-    return bodies.count + len(bodies.planes) * bodies.points.shape[1]
+    points = bodies.points.shape[1]
+    planes = len(bodies.planes)
+    return bodies.count + planes * points
 
 
 def outer_radii(bodies: Pile) -> jax.Array:
@@ -113,7 +116,8 @@ def outer_radii(bodies: Pile) -> jax.Array:
     Equation: `R = max |c| + r`, c the points of a body, r its rim.
     """
     squares = jnp.sum(bodies.points**2, axis=2)
-    far = jnp.sqrt(jnp.max(squares, axis=1))
+    largest = jnp.max(squares, axis=1)
+    far = jnp.sqrt(largest)
     return far + bodies.rims
 
 
@@ -125,12 +129,16 @@ def least_radius(bodies: Pile) -> jax.Array:
     distance of its nearest side.
     """
     first_points = bodies.points[:, 0]
-    far = jnp.sqrt(jnp.sum(first_points**2, axis=1))
-    if slots(bodies) == 1:
-        return jnp.min(bodies.rims - far)
+    squares = jnp.sum(first_points**2, axis=1)
+    far = jnp.sqrt(squares)
     inside = bodies.rims - far
-    of_round = jnp.where(bodies.rims > 0, inside, jnp.inf)
-    return jnp.min(jnp.minimum(of_round, inner_radii(bodies.points)))
+    if slots(bodies) == 1:
+        return jnp.min(inside)
+    is_round = bodies.rims > 0
+    of_round = jnp.where(is_round, inside, jnp.inf)
+    of_polygons = inner_radii(bodies.points)
+    radii = jnp.minimum(of_round, of_polygons)
+    return jnp.min(radii)
 
 
 def crowd_of_cells(bodies: Pile) -> int:
@@ -145,9 +153,10 @@ def crowd_of_cells(bodies: Pile) -> int:
         return 0
     least = float(least_radius(bodies))
     largest = float(outer_radii(bodies).max())
-    crowd = crowd_of(least, largest + 0.5 * MARGIN * least, bodies.dimension)
+    d = bodies.dimension
+    crowd = crowd_of(least, largest + 0.5 * MARGIN * least, d)
     # of cells in which a body looks for partners
-    rows = (3 ** (bodies.dimension - 1) + 1) // 2
+    rows = (3 ** (d - 1) + 1) // 2
     if 2 * rows * crowd < bodies.count:
         return crowd
     return 0
@@ -158,10 +167,11 @@ def _circle_gaps(bodies: Pile, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.
     (C,).
     """
     # one by one: five times faster
-    columns = bodies.of_bodies(q)[:, : bodies.dimension].T
-    squares = sum((x[i] - x[j]) ** 2 for x in columns)
+    centres = bodies.of_bodies(q)[:, : bodies.dimension]
+    squares = sum((x[i] - x[j]) ** 2 for x in centres.T)
     radii = outer_radii(bodies)
-    return jnp.sqrt(squares) - radii[i] - radii[j]
+    distance = jnp.sqrt(squares)
+    return distance - radii[i] - radii[j]
 
 
 @full_precision
@@ -171,14 +181,16 @@ def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
     """
     n = bodies.planes[:, :-1]
     offset = bodies.planes[:, -1]
-    points = bodies.placed(q).points[:, None]
+    placed = bodies.placed(q)
+    points = placed.points[:, None]
     height = jnp.sum(points * n[None, :, None], axis=3)
     above_planes = height - offset[None, :, None]
     gap = above_planes - bodies.rims[:, None, None]
     sizes = np.array([shape.size for shape in bodies.shapes])
     number = np.arange(bodies.points.shape[1])
     unused = number[None] >= sizes[:, None]
-    return jnp.where(unused[:, None], jnp.inf, gap)
+    is_padding = unused[:, None]
+    return jnp.where(is_padding, jnp.inf, gap)
 
 
 def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
@@ -187,27 +199,29 @@ def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
     """
     if bodies.crowd == 0:
         return all_pairs(bodies.count)
-    distance = 2 * jnp.max(outer_radii(bodies)) + margin
+    radii = outer_radii(bodies)
+    distance = 2 * jnp.max(radii) + margin
     centres = bodies.of_bodies(q)[:, : bodies.dimension]
     return near_pairs(centres, distance, bodies.crowd)
 
 
 def _pair_contacts(
-    bodies: Pile, at: jax.Array, i: jax.Array, j: jax.Array
+    bodies: Pile, places: jax.Array, i: jax.Array, j: jax.Array
 ) -> ContactPoints:
     """Contacts of bodies i and j (g,), k = `slots` a pair: gaps (g, k), points (g, k,
     d), normals.
 
-    `at` (b, ..) are the coordinates of all bodies; normals are towards body i.
+    `places` (b, ..) are the coordinates of all bodies; normals are towards body i.
     """
-    placed = (bodies.placed_at(at[x], bodies.points[x]) for x in (i, j))
+    placed = (bodies.placed_at(places[x], bodies.points[x]) for x in (i, j))
     a, b = (body.points for body in placed)
     r = bodies.rims[i]
     s = bodies.rims[j]
     if slots(bodies) > 1:
         return any_pair(a, b, r, s)
     of_discs = round_on_round(a[:, 0], b[:, 0], r, s)
-    return ContactPoints(*(x[:, None] for x in of_discs))
+    one_each = (x[:, None] for x in of_discs)
+    return ContactPoints(*one_each)
 
 
 def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
@@ -218,8 +232,9 @@ def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
     """
     numbers = np.arange(bodies.count, dtype=np.int32)
     others = jnp.asarray(numbers)
-    to_planes = jnp.min(_plane_gaps(bodies, q), initial=jnp.inf)
-    at = bodies.of_bodies(q)
+    of_planes = _plane_gaps(bodies, q)
+    to_planes = jnp.min(of_planes, initial=jnp.inf)
+    places = bodies.of_bodies(q)
 
     def of_all_pairs() -> jax.Array:
         """The least gap () of all pairs and planes, body by body: no table holds all
@@ -229,9 +244,9 @@ def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
         def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
             """The least gap () with those of body i and every other one."""
             this = jnp.full_like(others, i)
-            gaps = _pair_contacts(bodies, at, this, others).gap
-            itself = (others == i)[:, None]
-            of_others = jnp.where(itself, jnp.inf, gaps)
+            contacts = _pair_contacts(bodies, places, this, others)
+            itself = others == i
+            of_others = jnp.where(itself[:, None], jnp.inf, contacts.gap)
             return jnp.minimum(least, jnp.min(of_others))
 
         count = jnp.int32(bodies.count)
@@ -243,7 +258,8 @@ def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
     near = _near_gaps(bodies, q, q, margin)
     of_near = jnp.min(near.gaps, initial=jnp.inf)
     least = jnp.minimum(of_near, to_planes)
-    sufficient = (least <= margin) & ~near.overflows
+    within = least <= margin
+    sufficient = within & ~near.overflows
     return jax.lax.cond(sufficient, lambda: least, of_all_pairs)
 
 
@@ -271,39 +287,54 @@ def _near_gaps(
     displacement = jnp.abs(of_places)
     # two bodies move by half of theirs from (q + later) / 2; larger ones are a
     # `coarse_step`
-    farthest = jnp.max(jnp.sum(displacement, axis=1))
+    ways = jnp.sum(displacement, axis=1)
+    farthest = jnp.max(ways)
     farther = jnp.minimum(farthest, MARGIN * least_radius(bodies))
-    near = _candidates(bodies, 0.5 * (q + later), below + farther)
+    middle = 0.5 * (q + later)
+    near = _candidates(bodies, middle, below + farther)
     pair = (near.first, near.second)
     circles = [_circle_gaps(bodies, x, *pair) for x in (q, later)]
     least_of_both = jnp.minimum(*circles)
     gaps = jnp.where(near.used, least_of_both, jnp.inf)
     if all(shape.centred for shape in bodies.shapes):
         column = gaps[:, None]
-        return _NearGaps(near.first, near.second, column, near.overflows)
+        return _NearGaps(*pair, column, near.overflows)
     # pairs among the candidates 0 to c
     so_far = jnp.cumsum(gaps <= below, dtype=jnp.int32)
     rows = -(-NEAR * bodies.count // BLOCK) * BLOCK  # rounded up to whole blocks
-    count = jnp.minimum(so_far[-1], rows)
-    at = jnp.stack([bodies.of_bodies(x) for x in (q, later)])  # (2, b, ..)
+    total = so_far[-1]
+    count = jnp.minimum(total, rows)
+    both_places = jnp.stack([bodies.of_bodies(x) for x in (q, later)])  # (2, b, ..)
 
     def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
         """The arrays i, j, gaps with the rows of the block from row `first` on."""
         used, place = chosen_rows(so_far, first, count)
-        bodies_of_pairs = (near.first, near.second)
-        i, j = (jnp.where(used, x[place], 0) for x in bodies_of_pairs)
-        gaps_at = jax.vmap(lambda at: _pair_contacts(bodies, at, i, j).gap)
-        both = gaps_at(at)
+        i, j = (jnp.where(used, x[place], 0) for x in pair)
+
+        def gaps_of(places: jax.Array) -> jax.Array:
+            """Gaps (BLOCK, slots) [m] of the block's pairs at these places."""
+            contacts = _pair_contacts(bodies, places, i, j)
+            return contacts.gap
+
+        both = jax.vmap(gaps_of)(both_places)
         least = jnp.min(both, axis=0)
-        new = i, j, jnp.where(used[:, None], least, jnp.inf)
-        return tuple(with_block(x, part, first) for x, part in zip(filled, new))
+        least = jnp.where(used[:, None], least, jnp.inf)
+        return _with_blocks(filled, (i, j, least), first)
 
     none = jnp.zeros(rows, jnp.int32)
-    unknown = jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
+    count_of_slots = slots(bodies)
+    unknown = jnp.full((rows, count_of_slots), jnp.inf, q.dtype)
     start: _Arrays = none, none, unknown
     i, j, gaps = over_blocks(count, fill_block, start)
-    too_many = so_far[-1] > rows
-    return _NearGaps(i, j, gaps, near.overflows | too_many)
+    too_many = total > rows
+    overflows = near.overflows | too_many
+    return _NearGaps(i, j, gaps, overflows)
+
+
+def _with_blocks(filled: _Arrays, blocks: _Arrays, first: jax.Array) -> _Arrays:
+    """The arrays with the rows of these blocks from row `first` on."""
+    pairs = zip(filled, blocks)
+    return tuple(with_block(x, block, first) for x, block in pairs)
 
 
 def _closed(
@@ -317,19 +348,22 @@ def _closed(
     plane in turn.
     """
     near = _near_gaps(bodies, q, later, below)
-    at_both = jnp.minimum(_plane_gaps(bodies, q), _plane_gaps(bodies, later))
-    to_planes = at_both.reshape(-1)
+    at_q = _plane_gaps(bodies, q)
+    at_later = _plane_gaps(bodies, later)
+    smallest = jnp.minimum(at_q, at_later)
+    to_planes = smallest.reshape(-1)
     count = slots(bodies)
     partners = stride(bodies)
-    slot = np.arange(count, dtype=np.int32)[None]
+    slot = np.arange(count, dtype=np.int32)
     pair = near.first * partners + near.second
-    of_pairs = count * pair[:, None] + slot
+    of_pairs = count * pair[:, None] + slot[None]
     partner = np.arange(bodies.count, partners, dtype=np.int32)
     number = np.arange(bodies.count, dtype=np.int32)
     body = number[:, None]
-    at_planes = (count * (body * partners + partner)).reshape(-1)
-    numbers = jnp.concatenate([of_pairs.reshape(-1), at_planes])
-    gaps = jnp.concatenate([near.gaps.reshape(-1), to_planes])
+    at_planes = count * (body * partners + partner)
+    numbers = jnp.concatenate([of_pairs.reshape(-1), at_planes.reshape(-1)])
+    to_bodies = near.gaps.reshape(-1)
+    gaps = jnp.concatenate([to_bodies, to_planes])
     closed = gaps <= below
     return numbers, closed, near.overflows
 
@@ -348,7 +382,8 @@ def active_pairs(
     numbers, closed, overflows = _closed(bodies, q, later, below)
     rows = -(-bodies.room // BLOCK) * BLOCK
     closed_up_to = jnp.cumsum(closed, dtype=jnp.int32)  # among the first k candidates
-    count = jnp.minimum(closed_up_to[-1], rows)
+    total = closed_up_to[-1]
+    count = jnp.minimum(total, rows)
     d = bodies.dimension
     # above all numbers
     no_contact = jnp.int32(slots(bodies) * bodies.count * stride(bodies))
@@ -360,27 +395,26 @@ def active_pairs(
         used, chosen = chosen_rows(closed_up_to, first, count)
         chosen = jnp.where(used, numbers[chosen], 0)
         i, j, directions = _of_contacts(bodies, q, chosen)
-        new = (
-            jnp.where(used, chosen, no_contact),
-            jnp.where(used[:, None], jnp.stack([i, j], axis=1), 0),
-            jnp.where(used[:, None, None, None], directions, 0.0),
-        )
-        return tuple(with_block(x, part, first) for x, part in zip(filled, new))
+        between = jnp.stack([i, j], axis=1)
+        number = jnp.where(used, chosen, no_contact)
+        between = jnp.where(used[:, None], between, 0)
+        directions = jnp.where(used[:, None, None, None], directions, 0.0)
+        return _with_blocks(filled, (number, between, directions), first)
+
+    velocities = d + bodies.angular
 
     start: _Arrays = (
         jnp.full(rows, no_contact, jnp.int32),
         jnp.zeros((rows, 2), jnp.int32),
-        jnp.zeros((rows, d, 2, d + bodies.angular), q.dtype),
+        jnp.zeros((rows, d, 2, velocities), q.dtype),
     )
     number, between, directions = over_blocks(count, fill_block, start)
+    row = jnp.asarray(np.arange(rows, dtype=np.int32))
+    too_many = total > bodies.room
+    overflows = overflows | too_many
+    reach = least_radius(bodies)
     return ActivePairs(
-        number,
-        jnp.asarray(np.arange(rows, dtype=np.int32)) < count,
-        count,
-        between,
-        directions,
-        overflows | (closed_up_to[-1] > bodies.room),
-        least_radius(bodies),
+        number, row < count, count, between, directions, overflows, reach
     )
 
 
@@ -393,29 +427,34 @@ def _of_contacts(
     j is the number of bodies for a plane; directions (K, d, 2, velocities) as of
     `ActivePairs`.
     """
-    pair, slot = jnp.divmod(number, jnp.int32(slots(bodies)))
-    i, partner = jnp.divmod(pair, jnp.int32(stride(bodies)))  # see `_closed`
-    other = jnp.minimum(partner, bodies.count - 1)
+    slots_of_pair = jnp.int32(slots(bodies))
+    partners = jnp.int32(stride(bodies))
+    pair, slot = jnp.divmod(number, slots_of_pair)
+    i, partner = jnp.divmod(pair, partners)  # see `_closed`
+    last = bodies.count - 1
+    other = jnp.minimum(partner, last)
     row = np.arange(len(number))
-    at = bodies.of_bodies(q)
-    _, points, normals = _pair_contacts(bodies, at, i, other)
+    places = bodies.of_bodies(q)
+    _, points, normals = _pair_contacts(bodies, places, i, other)
     point = points[row, slot]
     n = normals[row, slot]
     if len(bodies.planes):
         on_plane = (partner >= bodies.count)[:, None]
         number_at_planes = jnp.maximum(partner - bodies.count, 0)
-        corners_each = jnp.int32(bodies.points.shape[1])
-        plane, corner = jnp.divmod(number_at_planes, corners_each)
+        corners_of_body = jnp.int32(bodies.points.shape[1])
+        plane, corner = jnp.divmod(number_at_planes, corners_of_body)
         normal = bodies.planes[plane, :-1]
         n = jnp.where(on_plane, normal, n)
-        corners = bodies.placed_at(at[i], bodies.points[i]).points
+        placed = bodies.placed_at(places[i], bodies.points[i])
         rim = bodies.rims[i][:, None]
-        lowest = corners[row, corner] - rim * n
+        lowest = placed.points[row, corner] - rim * n
         point = jnp.where(on_plane, lowest, point)
     normal_row = n[:, None]
-    along = jnp.concatenate([normal_row, tangents_of(n)], axis=1)
+    tangents = tangents_of(n)
+    along = jnp.concatenate([normal_row, tangents], axis=1)
     jacobian = bodies.contact_jacobian
-    of_first = jacobian(at[i], point, along)
-    of_both = of_first, -jacobian(at[other], point, along)
+    of_first = jacobian(places[i], point, along)
+    of_second = jacobian(places[other], point, along)
+    directions = jnp.stack([of_first, -of_second], axis=2)
     second = jnp.minimum(partner, bodies.count)
-    return i, second, jnp.stack(of_both, axis=2)
+    return i, second, directions

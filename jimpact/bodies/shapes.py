@@ -48,8 +48,9 @@ class _PlanarBody(RigidBody):
         """Set the fields of a body with points (P, 2) [m] over the ground; see
         `RigidBody._set`.
         """
-        moments = positive("inertia", inertia)[None]
-        self._set(points, mass, moments, shape, rim, (0.0, 1.0))
+        moment = positive("inertia", inertia)
+        up = (0.0, 1.0)
+        self._set(points, mass, moment[None], shape, rim, up)
 
 
 class Block(_PlanarBody):
@@ -97,7 +98,8 @@ class Block(_PlanarBody):
         width = positive("width", width)
         height = positive("height", height)
         if inertia is None:
-            inertia = positive("mass", mass) * (height**2 + width**2) / 12
+            square = height**2 + width**2
+            inertia = positive("mass", mass) * square / 12
         check_choice("corners", corners, ("all", "base"))
         w = 0.5 * width
         h = 0.5 * height
@@ -120,7 +122,8 @@ class Block(_PlanarBody):
         """
         if len(self.shapes[0].order) == 4:
             return super().valid(q)
-        return jnp.min(self.placed(q).points[0, 2:, 1])
+        corners = self.placed(q).points
+        return jnp.min(corners[0, 2:, 1])
 
 
 class Polygon(_PlanarBody):
@@ -160,7 +163,7 @@ class Polygon(_PlanarBody):
         inertia.
         """
         c = as_float_array("corners", corners)
-        if c.ndim != 2 or c.shape[1] != 2 or c.shape[0] < 3:
+        if c.ndim != 2 or c.shape[-1] != 2 or len(c) < 3:
             raise ValueError(
                 f"Argument `corners` must have shape (k, 2), k >= 3, not {c.shape}."
             )
@@ -168,11 +171,13 @@ class Polygon(_PlanarBody):
         order = _around(c)
         c = c[np.array(order)]
         middle, about_middle = _moments(c)
-        inertia = _given_inertia(inertia, positive("mass", mass) * about_middle, centre)
+        homogeneous = positive("mass", mass) * about_middle
+        inertia = _given_inertia(inertia, homogeneous, centre)
         if centre is not None:
             middle = as_numbers("centre", centre, (2,), "a vector")
         points = c - middle[None]
-        if not is_traced(points) and not float(inner_radii(points[None])[0]) > 0:
+        known = not is_traced(points)
+        if known and not float(inner_radii(points[None])[0]) > 0:
             raise ValueError(
                 f"Argument `centre` must lie inside the polygon, but has value "
                 f"{middle.tolist()}."
@@ -287,15 +292,18 @@ class _SpatialBody(RigidBody):
             shape: numbers and kind of the points.
             rim: radius about the points [m].
         """
-        inertia = _given_inertia(inertia, positive("mass", mass) * homogeneous, centre)
+        of_homogeneous = positive("mass", mass) * homogeneous
+        inertia = _given_inertia(inertia, of_homogeneous, centre)
         n = as_numbers("normal", normal, (3,), "a vector")
-        if not is_traced(n) and not float(n[2]) > 0:
+        known = not is_traced(n)
+        if known and not float(n[-1]) > 0:
             raise ValueError(
                 f"Argument `normal` must point up (its z > 0), but has value "
                 f"{n.tolist()}."
             )
-        n = n / jnp.sqrt(jnp.sum(n**2))
-        self._set(points, mass, _moments_in_space(inertia), shape, rim, n)
+        length = jnp.sqrt(jnp.sum(n**2))
+        moments = _moments_in_space(inertia)
+        self._set(points, mass, moments, shape, rim, n / length)
 
 
 class Box(_SpatialBody):
@@ -347,28 +355,37 @@ class Box(_SpatialBody):
         Moments of inertia of a homogeneous box over its mass are `(b^2 + c^2) / 12`,
         ...
         """
-        sizes = positives("sizes", as_float_array("sizes", sizes), 3)
+        sizes = as_float_array("sizes", sizes)
+        sizes = positives("sizes", sizes, 3)
         rounding = positive("rounding", rounding, low_allowed=True)
-        from_middle = np.zeros(3) if centre is None else centre
+        if centre is None:
+            from_middle = np.zeros(3)
+        else:
+            from_middle = centre
         middle = -as_numbers("centre", from_middle, (3,), "a vector")
         if not is_traced((sizes, rounding, middle)):
             half = 0.5 * np.asarray(sizes)
-            check_values("rounding", rounding, high=float(half.min()))
+            largest = float(half.min())
+            check_values("rounding", rounding, high=largest)
             if not (np.abs(middle) < half).all():
                 raise ValueError(
                     "Argument `centre` must lie inside the box, but has value "
                     f"{(-np.asarray(middle)).tolist()}."
                 )
-        from_corners = (0.5 * sizes - rounding)[None]
-        points = middle[None] + jnp.asarray(_SIGNS, sizes.dtype) * from_corners
-        homogeneous = (jnp.sum(sizes**2) - sizes**2) / 12
-        shape = Shape(tuple(range(8)), 8, faces=True, centred=False)
+        from_corners = 0.5 * sizes - rounding
+        signs = jnp.asarray(_SIGNS, sizes.dtype)
+        points = middle[None] + signs * from_corners[None]
+        squares = sizes**2
+        homogeneous = (jnp.sum(squares) - squares) / 12
+        corners = tuple(range(8))
+        shape = Shape(corners, 8, faces=True, centred=False)
         self._make(points, mass, inertia, homogeneous, centre, normal, shape, rounding)
 
     @property
     def sizes(self) -> jax.Array:
         """(a, b, c) [m]."""
-        diagonal = self.points[0, -1] - self.points[0, 0]
+        corners = self.points[0]
+        diagonal = corners[-1] - corners[0]
         return diagonal + 2 * self.rims[0]
 
 
@@ -408,9 +425,11 @@ class Sphere(_SpatialBody):
         radius = positive("radius", radius)
         isotropic = inertia is None or np.ndim(inertia) == 0
         if inertia is not None and isotropic:
-            inertia = jnp.stack([number("inertia", inertia)] * 3)
+            moment = number("inertia", inertia)
+            inertia = jnp.stack([moment] * 3)
         shape, middle = _round_shape(radius, centre, 3, isotropic)
-        homogeneous = jnp.stack([0.4 * radius**2] * 3)
+        over_mass = 0.4 * radius**2
+        homogeneous = jnp.stack([over_mass] * 3)
         self._make(
             middle[None], mass, inertia, homogeneous, centre, normal, shape, radius
         )
@@ -525,7 +544,8 @@ class Coin(_SpatialBody):
         outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         points = self._rims(jnp.asarray(outward))
         across = (3 * radius**2 + thickness**2) / 12
-        homogeneous = jnp.stack([across, across, 0.5 * radius**2])
+        along = 0.5 * radius**2
+        homogeneous = jnp.stack([across, across, along])
         # on edge it does not look the same from all sides: not `centred`
         corner_numbers = tuple(range(len(points)))
         shape = Shape(corner_numbers, len(points), faces=False, centred=False)
@@ -540,9 +560,9 @@ class Coin(_SpatialBody):
         outward = outward.astype(self.disc.dtype)
         sides = jnp.array([-1.0, 1.0], outward.dtype)
         levels = 0.5 * thickness * sides
-        each = jnp.repeat(levels, len(outward))[:, None]
-        rims = jnp.tile(radius * outward, (2, 1))
-        return jnp.concatenate([rims, each], axis=1)
+        z = jnp.repeat(levels, len(outward))
+        x_y = jnp.tile(radius * outward, (2, 1))
+        return jnp.concatenate([x_y, z[:, None]], axis=1)
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
@@ -560,7 +580,8 @@ class Coin(_SpatialBody):
         n (3,).
         """
         turn = rotation(quaternion_of(q))
-        return turn, self.plane_normals[0] @ turn
+        normal = self.plane_normals[0]
+        return turn, normal @ turn
 
     @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
@@ -571,11 +592,14 @@ class Coin(_SpatialBody):
             return super().contacts(q)
         turn, up = self._toward(q)
         # direction from the axis to them, -(u_1, u_2) / s
-        _, towards = lengths(_across_axis(up)[None])
+        across = _across_axis(up)
+        _, towards = lengths(across[None])
         rims = self._rims(-towards)
-        points = place_of(q)[None] + rims @ turn.T
+        centre = place_of(q)
+        points = centre[None] + rims @ turn.T
         n = jnp.broadcast_to(self.plane_normals, points.shape)
-        return ContactPoints(jnp.sum(n * points, axis=1), points, n)
+        gap = jnp.sum(n * points, axis=1)
+        return ContactPoints(gap, points, n)
 
     def pairs_in_contact(self) -> np.ndarray:
         """Body 0 and the plane, -1, of each contact (m, 2)."""
@@ -590,7 +614,8 @@ class Coin(_SpatialBody):
         if self.points.size:
             return length
         _, up = self._toward(q)
-        (s,), _ = lengths(_across_axis(up)[None])
+        across = _across_axis(up)
+        (s,), _ = lengths(across[None])
         return jnp.minimum(length, s - FLAT)
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
@@ -614,7 +639,8 @@ class Coin(_SpatialBody):
         rims = points.reshape(2, -1, 3)
         ends = jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])
         across = np.asarray(self._rims(ends))
-        turn = np.asarray(rotation(quaternion_of(jnp.asarray(q))))
+        quaternion = quaternion_of(jnp.asarray(q))
+        turn = np.asarray(rotation(quaternion))
         _, diameter = across.reshape(2, -1, 3)  # of the lower and of the upper rim
         in_body = (*rims, diameter)
         return [place_of(q) + curve @ turn.T for curve in in_body]
@@ -647,9 +673,8 @@ def _round_shape(
     middle = jnp.zeros(d, radius.dtype)
     if centre is not None:
         middle = -as_numbers("centre", centre, (d,), "a vector")
-        if not is_traced((middle, radius)) and not np.linalg.norm(middle) <= float(
-            radius
-        ):
+        known = not is_traced((middle, radius))
+        if known and not np.linalg.norm(middle) <= float(radius):
             raise ValueError(
                 f"Argument `centre` must be at most {float(radius):g} m from the "
                 f"middle, but has value {(-middle).tolist()}."
@@ -677,9 +702,11 @@ def _dimer(
     rod = positive("rod_mass", rod_mass, low_allowed=True)
     directions = jnp.array([[1.0, 0.0], [-1.0, 0.0]], arm.dtype)
     ends = arm * directions
-    of_spheres = 2 * sphere * (0.4 * radius**2 + arm**2)
-    inertia = of_spheres + rod * length**2 / 12
-    return ends, 2 * sphere + rod, inertia
+    about_own = 0.4 * radius**2
+    of_spheres = 2 * sphere * (about_own + arm**2)
+    of_rod = rod * length**2 / 12
+    mass = 2 * sphere + rod
+    return ends, mass, of_spheres + of_rod
 
 
 def _moments_in_space(value: Any) -> jax.Array:
@@ -700,7 +727,10 @@ def _moments_in_space(value: Any) -> jax.Array:
     except ValueError as error:
         words = str(error).replace("`mass`", "`inertia`")
         raise ValueError(words.replace("M ", "I ")) from None
-    moments = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
+    principal = np.asarray(inertia)
+    if principal.ndim > 1:
+        principal = np.linalg.eigvalsh(principal)
+    moments = np.sort(principal)
     *others, largest = moments
     if largest > (1 + _SLACK) * sum(others):
         raise ValueError(
@@ -721,13 +751,16 @@ def _around(corners: jax.Array) -> tuple[int, ...]:
     if is_traced(corners):
         return tuple(range(k))
     c = np.asarray(corners, float)
-    side = np.roll(c, -1, axis=0) - c
+    following = np.roll(c, -1, axis=0)
+    side = following - c
     after = np.roll(side, -1, axis=0)
     # [rad] between sides
     cosine = np.sum(side * after, axis=1)
-    turn = np.arctan2(_cross(side, after), cosine)
+    sine = _cross(side, after)
+    turn = np.arctan2(sine, cosine)
     around = np.sign(turn.sum())  # 1: counter-clockwise
-    good = (turn * around > 0) & (turn * around < np.pi)
+    onward = turn * around
+    good = (onward > 0) & (onward < np.pi)
     bad = np.flatnonzero(~good)
     if bad.size:
         worst = int(bad[0] + 1) % k
@@ -736,7 +769,8 @@ def _around(corners: jax.Array) -> tuple[int, ...]:
             f"corner {worst}, {c[worst].tolist()}."
         )
     full_turn = abs(turn.sum())
-    if abs(full_turn - 2 * np.pi) > _FULL_TURN:
+    off = full_turn - 2 * np.pi
+    if abs(off) > _FULL_TURN:
         raise ValueError(
             f"Argument `corners` {_CONVEX}, but they go around it more than once."
         )
@@ -752,7 +786,9 @@ def _across_axis(direction: jax.Array) -> jax.Array:
 
 def _cross(a: Any, b: Any) -> Any:
     """Cross products (..) of vectors (.., 2) in the plane."""
-    return a[..., 0] * b[..., -1] - a[..., -1] * b[..., 0]
+    a_x = a[..., 0]
+    a_y = a[..., -1]
+    return a_x * b[..., -1] - a_y * b[..., 0]
 
 
 @jax.jit  # operation by operation JAX would compile thirty programs
@@ -763,11 +799,14 @@ def inner_radii(corners: jax.Array) -> jax.Array:
     Equation: `min(c_i x s_i / |s_i|)` over the sides s_i from `corners` c_i (b, K, 2)
     with a length, negative for an origin outside; infinite for a single point.
     """
-    side = jnp.roll(corners, -1, axis=1) - corners
-    length = jnp.sqrt(jnp.sum(side**2, axis=2))
-    divisor = jnp.where(length > 0, length, 1.0)
+    following = jnp.roll(corners, -1, axis=1)
+    side = following - corners
+    squares = jnp.sum(side**2, axis=2)
+    length = jnp.sqrt(squares)
+    has_length = length > 0
+    divisor = jnp.where(has_length, length, 1.0)
     distance = _cross(corners, side) / divisor
-    of_sides = jnp.where(length > 0, distance, jnp.inf)
+    of_sides = jnp.where(has_length, distance, jnp.inf)
     return jnp.min(of_sides, axis=1)
 
 
@@ -781,15 +820,18 @@ def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
     about corner 0 is `sum A_i (a_i^2 + a_i . b_i + b_i^2) / (6 sum A_i)`, less the
     centroid's square.
     """
-    start = (
-        ring - ring[None, 0]
-    )  # about a corner: far from the origin, areas would cancel
+    # about a corner: far from the origin, areas would cancel
+    corner = ring[0]
+    start = ring - corner[None]
     end = jnp.roll(start, -1, axis=0)
     twice_area = _cross(start, end)  # of the triangles at corner 0
     total = jnp.sum(twice_area)
-    weighted = (start + end) * twice_area[:, None]
+    both = start + end
+    weighted = both * twice_area[:, None]
     middle = jnp.sum(weighted, axis=0) / (3 * total)
     terms = start**2 + start * end + end**2
     squares = jnp.sum(terms, axis=1)
-    about_corner = jnp.sum(twice_area * squares) / (6 * total)
-    return ring[0] + middle, about_corner - jnp.sum(middle**2)
+    of_areas = jnp.sum(twice_area * squares)
+    about_corner = of_areas / (6 * total)
+    about_middle = about_corner - jnp.sum(middle**2)
+    return corner + middle, about_middle

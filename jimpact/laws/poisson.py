@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jimpact.core.contact import Contact
 from jimpact.core.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
-from jimpact.numerics.dense import null_projector
+from jimpact.numerics.dense import null_projector, unit_outside
 from jimpact.numerics.friction import FrictionImpulses, solve
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix, is_regular
@@ -253,10 +253,8 @@ def _free_columns(w: jax.Array, loaded: jax.Array) -> jax.Array:
     loaded contacts, `D = diag(sqrt(W_jj))`.
     """
     d = jax.lax.stop_gradient(jnp.sqrt(jnp.diagonal(w)))
-    between_loaded = loaded[:, None] & loaded[None, :]
-    unit = jnp.eye(len(loaded), dtype=w.dtype)
     normalized = w / (d[:, None] * d[None, :])
-    projector, _ = null_projector(jnp.where(between_loaded, normalized, unit))
+    projector, _ = null_projector(unit_outside(normalized, loaded))
     return projector / d[:, None]
 
 

@@ -14,6 +14,7 @@ from jimpact.core.scene import Scene, momentum
 from jimpact.motion.dynamics import free_acceleration, mass_at, user_force
 from jimpact.motion.persistent_contact import contacts_at
 from jimpact.motion.system import System
+from jimpact.numerics.dense import unit_outside
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.tools.checks import as_float_array, as_numbers
 from jimpact.tools.compiling import full_precision, quick_jit
@@ -45,11 +46,15 @@ class QuasiLagrange(NamedTuple):
         = 0.
         """
         b = self.bilateral
-        push = as_float_array("force", force) * self.norm[b:]
-        by_push = self.matrix[:b, b:] @ push
-        rest = self.normal[:b] - by_push
-        held = self.matrix[:b, :b]
-        return jnp.linalg.solve(held, rest) / self.norm[:b]
+        norm = self.norm
+        lambda_u = as_float_array("force", force)
+        lambda_bar_u = lambda_u * norm[b:]
+        of_bilateral = self.matrix[:b]
+        g_bb = of_bilateral[:, :b]
+        g_bu = of_bilateral[:, b:]
+        rest = self.normal[:b] - g_bu @ lambda_bar_u
+        lambda_bar_b = jnp.linalg.solve(g_bb, rest)
+        return lambda_bar_b / norm[:b]
 
     @full_precision
     def rates(
@@ -60,11 +65,14 @@ class QuasiLagrange(NamedTuple):
 
         Equation: `qn' = G lambda_bar - F_norm`, `qt' = -F_tan`.
         """
-        one = jnp.ones_like(self.norm[self.bilateral :])
-        push = as_float_array("force", force) * one
-        held = self.bilateral_forces(push)
-        every = jnp.concatenate([held, push]) * self.norm
-        return self.matrix @ every - self.normal, -self.tangential
+        b = self.bilateral
+        one = jnp.ones_like(self.norm[b:])
+        lambda_u = as_float_array("force", force) * one
+        lambda_b = self.bilateral_forces(lambda_u)
+        forces = jnp.concatenate([lambda_b, lambda_u])
+        lambda_bar = forces * self.norm
+        normal = self.matrix @ lambda_bar - self.normal
+        return normal, -self.tangential
 
 
 def quasi_lagrange(
@@ -144,39 +152,49 @@ def _terms(
 
     def scene_at(displacement: Float[Array, " n"]) -> Scene:
         """Mass and directions [grad h, grad f] after a displacement from q."""
-        at = body.nearby(q, displacement)
-        normals = body.normals(at)
+        displaced = body.nearby(q, displacement)
+        normals = body.normals(displaced)
         if contacts is not None:
-            normals = normals[:, jnp.array(contacts)]
+            chosen = jnp.array(contacts)
+            normals = normals[:, chosen]
         if constraints is not None:
-            gradient = jax.jacfwd(lambda u: constraints(body.nearby(at, u)))(
-                jnp.zeros_like(v)
-            )
+
+            def h(u: Float[Array, " n"]) -> Float[Array, " b"]:
+                """Constraints after a further displacement u."""
+                return constraints(body.nearby(displaced, u))
+
+            gradient = jax.jacfwd(h)(jnp.zeros_like(v))
             normals = jnp.concatenate([gradient.T, normals], axis=1)
-        return Scene(body.mass_matrix(at), normals)
+        mass = body.mass_matrix(displaced)
+        return Scene(mass, normals)
 
     def quasi(s: Float[Array, ""], w: Float[Array, " n"]) -> Float[Array, " n"]:
         """Quasi-velocities `Xi M w` after the time s at the velocity v, first order in
         s.
         """
         scene = scene_at(s * v)
-        both = jnp.concatenate(quasi_basis(scene), axis=1)
-        return both.T @ momentum(scene, w)
+        basis = jnp.concatenate(quasi_basis(scene), axis=1)
+        return basis.T @ momentum(scene, w)
 
-    scene = scene_at(jnp.zeros_like(v))
+    rest = jnp.zeros_like(v)
+    scene = scene_at(rest)
     push = user_force(system, q, v, t)
-    free = free_acceleration(system, q, v, push, mass_at(system, q))
+    mass = mass_at(system, q)
+    free = free_acceleration(system, q, v, push, mass)
     zero = jnp.zeros((), v.dtype)
+    one = jnp.ones_like(zero)
     # derivative at s = 0 along (1, q''): d/dt (Xi M q')
-    along = (jnp.ones_like(zero), free)
-    _, rate = jax.jvp(quasi, (zero, v), along)
+    _, rate = jax.jvp(quasi, (zero, v), (one, free))
     normal, _ = quasi_basis(scene)
     metric = jax.vmap(lambda x: momentum(scene, x), 1, 1)(normal)
     directions = scene.normals
-    norm = jnp.sum(directions * normal, axis=0)  # grad f^T M^-1 grad f / |grad f|
-    count = directions.shape[1]
+    norms = directions * normal
+    norm = norms.sum(axis=0)  # grad f^T M^-1 grad f / |grad f|
+    d = directions.shape[1]
     coupling = normal.T @ metric
-    return QuasiLagrange(-rate[:count], -rate[count:], coupling, norm, 0)
+    f_norm = -rate[:d]
+    f_tan = -rate[d:]
+    return QuasiLagrange(f_norm, f_tan, coupling, norm, 0)
 
 
 class ContactProblem(NamedTuple):
@@ -205,10 +223,10 @@ def _forces(
     """Forces of `0 <= lambda _|_ D lambda + B >= 0` over held contacts, 0 at others
     [N].
     """
-    both = held[:, None] & held[None, :]
-    unit = jnp.eye(len(held), dtype=free.dtype)
-    matrix = jnp.where(both, delassus, unit)
+    matrix = unit_outside(delassus, held)
     offset = jnp.where(held, free, 1.0)
+    solution = solve_lcp(matrix, offset)
+    return solution.z
     return solve_lcp(matrix, offset).z
 
 

@@ -137,14 +137,18 @@ def tangential_stiffness_of(law: Law, start: Start) -> Float[Array, " m"] | None
             "contact forces of bodies that touch each other, whose tangents turn: it "
             f"is for contacts with planes, but {type(body).__name__} has pairs."
         )
-    of_contacts = jnp.broadcast_to(kappa, (start.contacts,))
-    return of_contacts.astype(start.q.dtype)
+    shape = (start.contacts,)
+    of_contacts = jnp.broadcast_to(kappa, shape)
+    dtype = start.q.dtype
+    return of_contacts.astype(dtype)
 
 
 def _touch_each_other(body: Bodies) -> bool:
     """True if a contact is between two bodies; the second one of a plane is -1."""
     bodies = body.pairs_in_contact()
-    return bool((bodies >= 0).all(axis=1).any())
+    is_body = bodies >= 0
+    of_two_bodies = is_body.all(axis=1)
+    return bool(of_two_bodies.any())
 
 
 def compliant_motion(
@@ -154,21 +158,26 @@ def compliant_motion(
     none closes.
     """
     run = partial(_run, max_events, until_apart)
-    return course_of(problem, _start(problem), run)[0]
+    start = _start(problem)
+    course, _ = course_of(problem, start, run)
+    return course
 
 
 def _start(problem: MotionProblem) -> State:
     """State at the beginning: indentations `x = -f`, 0 of closed gaps; no impulses
     yet, springs xi = 0.
     """
-    gap = gaps(problem.system, problem.q0, problem.times[0])
-    closed = jnp.abs(gap) <= problem.settings.closed_below
+    begin = problem.times[0]
+    gap = gaps(problem.system, problem.q0, begin)
+    closed_below = problem.settings.closed_below
+    closed = jnp.abs(gap) <= closed_below
     x = jnp.where(closed, 0.0, -gap)
     if problem.mu is None:
-        each = 0
+        directions = 0
     else:
-        each = problem.tangents // problem.contacts
-    impulses = jnp.zeros((1 + each, len(x)), x.dtype)
+        directions = problem.tangents // problem.contacts
+    rows = 1 + directions
+    impulses = jnp.zeros((rows, len(x)), x.dtype)
     contact = jnp.concatenate([x[None], impulses])
     start = problem.start._replace(contact=contact)
     if problem.tangential_stiffness is None:
@@ -191,8 +200,10 @@ def _run(max_events: int, until_apart: bool, problem: MotionProblem) -> MotionEn
         return on
 
     one = partial(_one_pass, max_events)
-    last = until_over(continues, one, problem, _begin(problem, max_events))
-    smooth = jnp.stack([last.flight.sample, last.event_count])
+    start = _begin(problem, max_events)
+    last = until_over(continues, one, problem, start)
+    samples = last.flight.sample
+    smooth = jnp.stack([samples, last.event_count])
     return end_of(problem, last, smooth)
 
 
@@ -210,12 +221,15 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     state = _start(problem)
     gamma, slip = _rates(problem, state)
     x = state.contact[0]
-    compressed = (x > 0) | ((x == 0) & (gamma <= 0))
+    indented = x > 0
+    touches = x == 0
+    closing = gamma <= 0
+    compressed = indented | (touches & closing)
     phase = jnp.where(compressed, Phase.COMPRESSION, Phase.OPEN)
     if not force.slackens:
-        expands = (x > 0) & (gamma > 0)
+        expands = indented & (gamma > 0)
         phase = jnp.where(expands, Phase.EXPANSION, phase)
-    phase = phase.astype(jnp.int32)
+    phase = jnp.int32(phase)
     margins = 2 * m
     fastest = jnp.maximum(-gamma, 0.0)
     if mu is not None:
@@ -251,14 +265,16 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
 
 
 def _rates(
-    problem: MotionProblem, at: State
+    problem: MotionProblem, state: State
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Gap velocities f' and speeds of slip |u| [m/s], these 0 without friction."""
     rubs = problem.mu is not None
-    normal, tangent = kinematics(problem.system, at.q, at.v, at.t, rubs)
+    normal, tangent = kinematics(problem.system, state.q, state.v, state.t, rubs)
+    gamma = normal.rate
     if tangent is None:
-        return normal.rate, jnp.zeros_like(normal.rate)
-    return normal.rate, length(by_contact(tangent.rate, problem.contacts))
+        return gamma, jnp.zeros_like(gamma)
+    slip = by_contact(tangent.rate, problem.contacts)
+    return gamma, length(slip)
 
 
 def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
@@ -268,19 +284,20 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
     Without an event modes remain, and with tangential springs, which decide by
     themselves.
     """
-    if problem.mu is None or problem.tangential_stiffness is not None:
+    has_springs = problem.tangential_stiffness is not None
+    if has_springs or problem.mu is None:
         return run
-    event = run.flight.event
-    old = run.flight.aim.modes, jnp.asarray(True)
-    happened = jnp.any(event)
+    flight = run.flight
+    old = flight.aim.modes, jnp.asarray(True)
+    happened = jnp.any(flight.event)
     new = jax.lax.cond(
         any_lane(happened), lambda: _new_modes(problem, run), lambda: old
     )
     modes, consistent = choose(happened, new, old)
     code = jnp.where(consistent, run.status, CODE["no_contact_force"])
-    status = code.astype(jnp.int32)
-    aim = run.flight.aim._replace(modes=modes)
-    flight = run.flight._replace(aim=aim)
+    status = jnp.int32(code)
+    aim = flight.aim._replace(modes=modes)
+    flight = flight._replace(aim=aim)
     return run._replace(flight=flight, status=status)
 
 
@@ -295,55 +312,70 @@ def _new_modes(
     """
     system, force, mu, settings, *_ = problem
     assert mu is not None
-    at = run.flight.state
+    flight = run.flight
+    state = flight.state
     m = problem.contacts
-    event = run.flight.event
-    phase, before = contact_modes(run.flight.aim.modes, at)
-    contacts = contacts_at(system, at.q, at.v, at.t, friction=True)
-    # by F
-    pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))
+    phase, old = contact_modes(flight.aim.modes, state)
+    contacts = contacts_at(system, state.q, state.v, state.t, friction=True)
+    push = normal_forces(force, phase, contacts, state)
+    pushed = with_normal_forces(contacts, push)
     scale = jnp.max(run.fastest)
-    slip = _rates(problem, at)[1]
-    stopped = slip_stops(settings, before, event[2 * m :], slip, scale)
-    # friction has reached its limit
-    let_go = (event[2 * m :] & before.stick) | stopped
-    released = jnp.concatenate([jnp.zeros_like(let_go), let_go])
+    _, slip = _rates(problem, state)
+    fired = flight.event[2 * m :]
+    stopped = slip_stops(settings, old, fired, slip, scale)
+    at_limit = fired & old.stick  # friction has reached mu F
+    let_go = at_limit | stopped
+    no_normal = jnp.zeros_like(let_go)
+    released = jnp.concatenate([no_normal, let_go])
     # largest acceleration: a share is rounding
     fastest = jnp.max(jnp.abs(pushed.approach))
-    rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(
-        settings, fastest
-    )
-    slides = (slip > rest) & ~stopped
-    slack = rest_acceleration(slip.dtype) * fastest
+    dtype = slip.dtype
+    share = not_rounding(REST_SPEED, dtype)
+    noise = velocity_noise(settings, fastest)
+    rest = share * scale + noise
+    moving = slip > rest
+    slides = moving & ~stopped
+    slack = rest_acceleration(dtype) * fastest
     acts = loaded(phase)
-    choice = choose_with_friction(pushed, mu, before, acts, released, slides, slack)
+    choice = choose_with_friction(pushed, mu, old, acts, released, slides, slack)
     # corners that sink in differently are nearly redundant: they stick where the
     # forces of the flow, which share what they hold, can hold them
     assert pushed.tangent is not None
-    moves = direction(by_contact(pushed.tangent.rate, m))  # of the slip
-    sign = jnp.where(slides, moves[:, 0], 1.0)
+    of_slip = direction(by_contact(pushed.tangent.rate, m))
+    sign = jnp.where(slides, of_slip[:, 0], 1.0)
     sticking = Modes(acts, acts & ~slides, sign)
     if settings.spatial:
-        sticking = sticking._replace(sign=jnp.ones_like(sticking.sign))
-    along = jnp.where(slides[:, None], moves, 0.0)
+        sticking = _without_sign(sticking)
+    along = jnp.where(slides[:, None], of_slip, 0.0)
     held = forces(pushed, mu, sticking, along)
     left = cone_margins(pushed, mu, held)  # [m/s^2] to the rim
     within = WITHIN * friction_acceleration(pushed, mu, held.normal)
     # what passes the flat position turns: no forces hold both of its corners
     assert held.tangential is not None
-    both = jnp.concatenate([held.normal, held.tangential])
+    all_forces = jnp.concatenate([held.normal, held.tangential])
     # slip acceleration of contacts that stick: not 0 where forces cannot hold them
-    acceleration = pushed.approach + pushed.delassus @ both
+    acceleration = pushed.approach + pushed.delassus @ all_forces
     growth = length(by_contact(acceleration[m:], m))
-    least = jnp.where(let_go, within, 0.0)
-    holds = (growth <= within) & (left >= least)
-    sticks = jnp.all(~sticking.stick | holds)
+    reserve = jnp.where(let_go, within, 0.0)
+    at_rest = growth <= within
+    in_cone = left >= reserve
+    holds = at_rest & in_cone
+    holds_or_slides = ~sticking.stick | holds
+    sticks = jnp.all(holds_or_slides)
     chosen = choose(sticks, sticking, choice.modes)
     # a force that changes as fast as in a contact has slip begin at once
     if settings.spatial:
-        chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
-    new_rows = mode_rows(ContactModes(phase, chosen))
-    return new_rows[:, None], choice.consistent | sticks
+        chosen = _without_sign(chosen)
+    new = ContactModes(phase, chosen)
+    rows = mode_rows(new)
+    consistent = choice.consistent | sticks
+    return rows[:, None], consistent
+
+
+def _without_sign(modes: Modes) -> Modes:
+    """Modes of contacts in space, whose slip has a direction but no sign: 1."""
+    one = jnp.ones_like(modes.sign)
+    return modes._replace(sign=one)
 
 
 def _one_pass(
@@ -360,7 +392,8 @@ def _one_pass(
     flight = run.flight
     m = problem.contacts
     springs = problem.tangential_stiffness is not None
-    given = problem, flight.state, flight.aim.modes, run.fastest
+    modes = flight.aim.modes
+    given = problem, flight.state, modes, run.fastest
     flow: CompliantFlow
     if springs:
         flow = spring_flow(*given)
@@ -369,10 +402,10 @@ def _one_pass(
     settings = problem.settings
     allowed = _allowed_errors(problem, flow, flight.state)
     flown, _ = one_pass(flow, settings, allowed, times, flight)
-    before = flight.aim.modes[:m, 0]
-    after = flown.aim.modes[:m, 0]
-    was_open = before == Phase.OPEN
-    is_open = after == Phase.OPEN
+    old_phase = modes[:m, 0]
+    new_phase = flown.aim.modes[:m, 0]
+    was_open = old_phase == Phase.OPEN
+    is_open = new_phase == Phase.OPEN
     closed = was_open & ~is_open
     opened = ~was_open & is_open
     gamma, slip = _rates(problem, flown.state)
@@ -386,45 +419,54 @@ def _one_pass(
     if springs:
         turned = flown.event[2 * m : 3 * m]
     elif problem.mu is not None:
-        friction = contact_modes(flight.aim.modes, flown.state).friction
+        friction = contact_modes(modes, flown.state).friction
         flown, vanished = _ended_slip(problem, run, flown, friction, slip)
         fired = flown.event[2 * m :]
         stopped = slip_stops(settings, friction, fired, slip, flow.scales.slip)
-        turned = (fired & friction.stick) | stopped
+        at_limit = fired & friction.stick
+        turned = at_limit | stopped
         flown = flown._replace(state=flow.stopped(stopped, flown.state))
-    at = flown.state
-    happened = jnp.any(closed | opened | turned)
-    full = happened & (run.event_count >= max_events)  # no row is left
+    state = flown.state
+    changes = closed | opened | turned
+    happened = jnp.any(changes)
+    count = run.event_count
+    full = happened & (count >= max_events)  # no row is left
     written = happened & ~full
     status = jnp.where(full, CODE["max_events"], run.status)
     marks = _marks(closed, opened, turned)
-    row = jnp.where(written, run.event_count, max_events)
-    table = run.table.with_sample(at, flight.sample)
+    row = jnp.where(written, count, max_events)
+    table = run.table.with_sample(state, flight.sample)
+    leaves = is_open & (gamma >= 0)
     return _CompliantRun(
         flight=flown,
         fastest=jax.lax.stop_gradient(jnp.maximum(run.fastest, fastest)),
-        table=table.with_event(_event(problem, at, opened), marks, row),
-        event_count=run.event_count + written.astype(jnp.int32),
-        status=status.astype(jnp.int32),
-        apart=jnp.all((after == Phase.OPEN) & (gamma >= 0)),
+        table=table.with_event(_event(problem, state, opened), marks, row),
+        event_count=count + jnp.int32(written),
+        status=jnp.int32(status),
+        apart=jnp.all(leaves),
         vanished=vanished,
     )
 
 
 def _allowed_errors(
-    problem: MotionProblem, flow: CompliantFlow, at: State
+    problem: MotionProblem, flow: CompliantFlow, state: State
 ) -> Float[Array, " rows"]:
     """Errors that a step may make in the rows of the state but q and v: in time and
     works, then in indentations, impulses and springs by the scales of the contacts.
     """
     settings = problem.settings
-    without = at._replace(contact=at.contact[:0], spring=())
+    no_rows = state.contact[:0]
+    without = state._replace(contact=no_rows, spring=())
     ledger = allowed_errors(problem.system, settings, without, 1.0)
-    impulses = len(at.contact) - 1
-    sizes = [flow.scales.depth, *[flow.scales.impulse] * impulses]
-    sizes.extend(flow.sizes_of_springs(at))
-    of_contacts = settings.rtol * jnp.concatenate(sizes)
-    return jnp.concatenate([ledger, of_contacts])
+    scales = flow.scales
+    rows = len(state.contact)
+    sizes = [scales.depth]
+    sizes += [scales.impulse] * (rows - 1)
+    springs = flow.sizes_of_springs(state)
+    sizes.extend(springs)
+    of_contacts = jnp.concatenate(sizes)
+    errors = settings.rtol * of_contacts
+    return jnp.concatenate([ledger, errors])
 
 
 def _marks(
@@ -436,11 +478,13 @@ def _marks(
     `friction`.
     """
     any_opened = jnp.any(opened)
+    any_closed = jnp.any(closed)
     kind = jnp.where(any_opened, KIND_CODE["detachment"], KIND_CODE["friction"])
-    kind = jnp.where(jnp.any(closed), KIND_CODE["contact"], kind)
+    kind = jnp.where(any_closed, KIND_CODE["contact"], kind)
     no_law = 0 * kind
-    some = (closed | opened | turned).astype(kind.dtype)
-    return jnp.concatenate([jnp.stack([kind, no_law]), some])
+    takes_part = closed | opened | turned
+    of_contacts = takes_part.astype(kind.dtype)
+    return jnp.concatenate([jnp.stack([kind, no_law]), of_contacts])
 
 
 def _ended_slip(
@@ -461,31 +505,37 @@ def _ended_slip(
     step lands on its cone.
     """
     m = problem.contacts
-    most = problem.settings.max_steps
+    max_steps = problem.settings.max_steps
     fastest = jnp.max(run.fastest)
     scale = jnp.maximum(fastest, jnp.max(slip))
-    ends = friction.active & ~friction.stick & (slip <= STOPPED * scale)
-    some_left = flown.steps < most
-    vanished = flown.stuck & some_left & (flown.state.t > run.vanished)
+    slides = friction.active & ~friction.stick
+    slow = slip <= STOPPED * scale
+    ends = slides & slow
+    some_left = flown.steps < max_steps
+    t = flown.state.t
+    later = t > run.vanished
+    vanished = flown.stuck & some_left & later
     here = vanished & jnp.any(ends)
     event = flown.event.at[2 * m :].set(ends)
     goes_on = flown._replace(event=event, stuck=jnp.asarray(False))
     again = toward_sample(goes_on, problem.times, flown.free)
-    last = jnp.where(here, flown.state.t, run.vanished)
+    last = jnp.where(here, t, run.vanished)
     return choose(here, again, flown), last
 
 
 def _event(
-    problem: MotionProblem, at: State, opened: Bool[Array, " m"]
+    problem: MotionProblem, state: State, opened: Bool[Array, " m"]
 ) -> Float[Array, " w"]:
     """Row of an event: impulses of contacts that have `opened`; velocities do not
     jump.
     """
-    none = no_jump(at, problem.contacts, problem.tangents)
-    zero = jnp.zeros_like(at.t)
-    push, *tangential = jnp.where(opened, at.contact[1:], 0.0)
+    none = no_jump(state, problem.contacts, problem.tangents)
+    zero = jnp.zeros_like(state.t)
+    push, *tangential = jnp.where(opened, state.contact[1:], 0.0)
     jump = none._replace(impulse=push)
     if tangential:
         by_tangent = jnp.stack(tangential, axis=1)
         jump = jump._replace(tangential=by_tangent.reshape(-1))
-    return event_numbers(at, After(at, jump, Passed(zero, zero)))
+    passed = Passed(zero, zero)
+    after = After(state, jump, passed)
+    return event_numbers(state, after)

@@ -83,14 +83,18 @@ def contact_scales(
     Equation: the indentation x that stores the energy `speed^2 / (2 W_jj)`, the force
     F(x, 0), the impulse `speed / W_jj`.
     """
-    m = len(contacts.normal.rate)
+    gamma = contacts.normal.rate
+    m = len(gamma)
     w = jnp.diagonal(contacts.delassus)[:m]
     slip = jnp.maximum(jnp.max(fastest), SLOWEST)
     speed = jnp.maximum(fastest[:m], SLOWEST)
-    depth = force.indentation_scale(0.5 * speed**2 / w)
-    push = force.force(depth, jnp.zeros_like(depth))
+    energy = 0.5 * speed**2 / w
+    depth = force.indentation_scale(energy)
+    no_rate = jnp.zeros_like(depth)
+    push = force.force(depth, no_rate)
     onset = force.onset_scale(depth, speed)
-    scales = ContactScales(speed, depth, push, onset, speed / w, slip)
+    impulse = speed / w
+    scales = ContactScales(speed, depth, push, onset, impulse, slip)
     return jax.lax.stop_gradient(scales)
 
 
@@ -121,18 +125,24 @@ class CompliantFlow(MotionFlow):
         """Phases and modes of friction from their rows."""
         return contact_modes(modes, self.like)
 
-    def contact_forces(self, const: ContactModes, at: State) -> tuple[Contacts, Forces]:
+    def contact_forces(
+        self, const: ContactModes, state: State
+    ) -> tuple[Contacts, Forces]:
         """Contact space with the normal forces F of the law, and all forces.
 
-        Tangential ones keep the modes of friction, `M v' = (loads) + N F + H lambda_t`.
+        Tangential ones keep the modes of friction, `M v' = (loads) + N F + H lambda_t`;
+        without friction there are none.
         """
-        contacts = self.contacts(at)
-        push = normal_forces(self.force, const.phase, contacts, at)
-        if self.mu is None:
-            return contacts, Forces(push, None, contacts.free + contacts.moved @ push)
+        contacts = self.contacts(state)
+        phase, friction = const
+        push = normal_forces(self.force, phase, contacts, state)
+        mu = self.mu
+        if mu is None:
+            acceleration = contacts.free + contacts.moved @ push
+            return contacts, Forces(push, None, acceleration)
         known = with_normal_forces(contacts, push)
-        slip = self.slip(const.friction, known)
-        return known, forces(known, self.mu, const.friction, slip)
+        slip = self.slip(friction, known)
+        return known, forces(known, mu, friction, slip)
 
     def field(
         self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
@@ -142,27 +152,29 @@ class CompliantFlow(MotionFlow):
         Equation: as of the class; powers `F . v` of loads, `lambda_n f'` and
         `lambda_t . u` of contacts; `x' = -f'`, p' = lambda.
         """
-        at = unpacked(self.like, y)
-        contacts, force = self.contact_forces(const, at)
+        state = unpacked(self.like, y)
+        contacts, force = self.contact_forces(const, state)
         gamma = contacts.normal.rate
         push = force.normal
+        system = self.system
         closing = unloading(self.force, const.phase, -gamma)
-        friction, base = contact_powers(self.system, contacts, force, at.t)
+        friction, base = contact_powers(system, contacts, force, state.t)
         remembered = [closing, push]
         if force.tangential is not None:
             along = self.along_tangents(force.tangential)
-            remembered.extend(by_contact(along, len(push)).T)
+            tangential = by_contact(along, len(push))
+            remembered.extend(tangential.T)
         rates = State(
-            q=self.system.body.rates(at.q, at.v),
+            q=system.body.rates(state.q, state.v),
             v=force.acceleration,
-            t=jnp.ones_like(at.t),
-            work=user_force(self.system, at.q, at.v, at.t) @ at.v,
+            t=jnp.ones_like(state.t),
+            work=user_force(system, state.q, state.v, state.t) @ state.v,
             base_work=base,
             contact_work=jnp.stack([push * gamma, friction]),
             contact=jnp.stack(remembered),
-            spring=self.spring_rates(const, at, contacts, force),
+            spring=self.spring_rates(const, state, contacts, force),
         )
-        rows = self.rows_of(rates, at, const.friction, contacts, force)
+        rows = self.rows_of(rates, state, const.friction, contacts, force)
         return jnp.concatenate(rows)
 
     def spring_rates(
@@ -181,9 +193,11 @@ class CompliantFlow(MotionFlow):
         """Tangential forces along the tangents of the body, from those along `axes`."""
         if self.axes is None:
             return tangential
-        each = by_contact(tangential, len(self.axes.along))
-        frames = slip_frames(self.axes.along)
-        return jnp.einsum("mj,mjk->mk", each, frames).reshape(-1)
+        along = self.axes.along
+        by_axes = by_contact(tangential, len(along))
+        frames = slip_frames(along)
+        by_tangents = jnp.einsum("mj,mjk->mk", by_axes, frames)
+        return by_tangents.reshape(-1)
 
     def margins(
         self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
@@ -191,20 +205,23 @@ class CompliantFlow(MotionFlow):
         """Rows of `_normal_margins`, with friction of `friction_margins`, and of the
         sample.
         """
-        at = unpacked(self.like, y)
-        if self.mu is None:
-            rates, _ = kinematics(self.system, at.q, at.v, at.t)
-            margins = self._normal_margins(const.phase, rates.rate, at.contact[0])
-            return self.from_margins(margins, at)
-        contacts, force = self.contact_forces(const, at)
-        x = at.contact[0]
-        normal = self._normal_margins(const.phase, contacts.normal.rate, x)
-        zero = jnp.zeros_like(at.t)
+        state = unpacked(self.like, y)
+        x = state.contact[0]
+        phase, friction = const
+        mu = self.mu
+        if mu is None:
+            normal, _ = kinematics(self.system, state.q, state.v, state.t)
+            margins = self._normal_margins(phase, normal.rate, x)
+            return self.from_margins(margins, state)
+        contacts, force = self.contact_forces(const, state)
+        gamma = contacts.normal.rate
+        by_normal = self._normal_margins(phase, gamma, x)
+        zero = jnp.zeros_like(state.t)
         one = zero + 1
-        friction = friction_margins(
-            contacts, self.mu, const.friction, force, one, zero, self.scales.slip
-        )
-        return self.from_margins(jnp.concatenate([normal, friction]), at)
+        scale = self.scales.slip
+        by_friction = friction_margins(contacts, mu, friction, force, one, zero, scale)
+        margins = jnp.concatenate([by_normal, by_friction])
+        return self.from_margins(margins, state)
 
     def _normal_margins(
         self, const: Int[Array, " m"], rate: Float[Array, " m"], x: Float[Array, " m"]
@@ -222,27 +239,34 @@ class CompliantFlow(MotionFlow):
         `Force.onset` in compression, minus that where slack, and the second one x: the
         contact opens at x = 0. All are in units of the scales.
         """
-        gamma = rate / self.scales.speed
-        depth = x / self.scales.depth
+        scales = self.scales
+        gamma = rate / scales.speed
+        depth = x / scales.depth
+        compressed = const == Phase.COMPRESSION
         if self.force.slackens:
             inside = jnp.where(x >= 0, x, 0.0)
-            onset = self.force.onset(inside, -rate) / self.scales.onset
-            by_x = jnp.where(const == Phase.COMPRESSION, onset, -onset)
+            left = self.force.onset(inside, -rate)
+            onset = left / scales.onset
+            by_x = jnp.where(compressed, onset, -onset)
             by_g = depth
         else:
-            by_x = jnp.where(const == Phase.EXPANSION, depth, 1.0)
-            by_g = jnp.where(const == Phase.COMPRESSION, -gamma, gamma)
-        by_x = jnp.where(const == Phase.OPEN, -depth, by_x)
-        by_rate = jnp.where(const == Phase.OPEN, 1.0, by_g)
+            expands = const == Phase.EXPANSION
+            by_x = jnp.where(expands, depth, 1.0)
+            by_g = jnp.where(compressed, -gamma, gamma)
+        is_open = const == Phase.OPEN
+        by_x = jnp.where(is_open, -depth, by_x)
+        by_rate = jnp.where(is_open, 1.0, by_g)
         return jnp.concatenate([by_x, by_rate])
 
     def rooted(self, modes: Int[Array, "k 1"]) -> Bool[Array, "margins 1"]:
         """True for margins of opening: landings on them step in the root of the
         indentation.
         """
-        phase = self.constants(modes).phase[:, None]
+        constants = self.constants(modes)
+        phase = constants.phase[:, None]
         opens = phase == Phase.EXPANSION
-        by_g = (phase == Phase.COMPRESSION) & self.force.slackens
+        compressed = phase == Phase.COMPRESSION
+        by_g = compressed & self.force.slackens
         others = self.rounding.shape[0] - 2 * opens.shape[0]
         rest = jnp.zeros((others, 1), bool)
         return jnp.concatenate([opens, by_g, rest])
@@ -259,115 +283,144 @@ class CompliantFlow(MotionFlow):
         Phases change as `_normal_margins` says; friction that sets in with a force is
         decided by `compliant_contact`.
         """
-        at = unpacked(self.like, y)
+        state = unpacked(self.like, y)
         phase, friction = self.constants(modes)
-        after, at = self.switched_phases(phase, at, which)
+        after, state = self.switched_phases(phase, state, which)
         rows = after
         if self.mu is not None:  # friction starts anew with the force
-            keeps = loaded(phase) & loaded(after)
-            rows = mode_rows(ContactModes(after, friction._replace(active=keeps)))
-        state = packed(at)
-        # `error_only_rows` stay as they are
-        state = jnp.concatenate([state, y[len(state) :]])
-        return rows[:, None].astype(modes.dtype), state
+            stays_loaded = loaded(phase) & loaded(after)
+            friction = friction._replace(active=stays_loaded)
+            new = ContactModes(after, friction)
+            rows = mode_rows(new)
+        of_state = packed(state)
+        error_only = y[len(of_state) :]  # these rows stay as they are
+        new_y = jnp.concatenate([of_state, error_only])
+        new_modes = rows[:, None]
+        return new_modes.astype(modes.dtype), new_y
 
     def switched_phases(
-        self, phase: Int[Array, " m"], at: State, which: Bool[Array, "margins 1"]
+        self, phase: Int[Array, " m"], state: State, which: Bool[Array, "margins 1"]
     ) -> tuple[Int[Array, " m"], State]:
         """Phases after the events `which`, and the state: x = 0 where a contact closed
         or opened, impulses 0 where it closed.
+
+        With a force that `slackens` compression turns to slack and back by x, and the
+        contact opens by its gap velocity. Else compression turns to expansion and back
+        by the gap velocity, and the contact opens by x, or, if e = 0, where it would
+        expand.
         """
         m = len(phase)
         by_x = which[:m, 0]
         by_g = which[m : 2 * m, 0]
-        closed = by_x & (phase == Phase.OPEN)
+        was_open = phase == Phase.OPEN
+        compressed = phase == Phase.COMPRESSION
+        closed = by_x & was_open
         if self.force.slackens:
-            slackens = by_x & (phase == Phase.COMPRESSION)
+            is_slack = phase == Phase.SLACK
+            slackens = by_x & compressed
+            tightens = by_x & is_slack
             after = jnp.where(slackens, Phase.SLACK, phase)
-            tightens = by_x & (phase == Phase.SLACK)
             after = jnp.where(tightens, Phase.COMPRESSION, after)
             opened = by_g
         else:
-            turned = by_g & (phase == Phase.COMPRESSION)
+            expands = phase == Phase.EXPANSION
+            turned = by_g & compressed
+            returns = by_g & expands
             after = jnp.where(turned, Phase.EXPANSION, phase)
-            returns = by_g & (phase == Phase.EXPANSION)
             after = jnp.where(returns, Phase.COMPRESSION, after)
-            opened = by_x & (phase == Phase.EXPANSION)
-            if self.force.bistiffness is not None:  # e = 0 returns nothing
-                opened = opened | (turned & (self.force.bistiffness.restitution == 0))
+            opened = by_x & expands
+            plastic = self.force.bistiffness
+            if plastic is not None:
+                returns_nothing = plastic.restitution == 0
+                opened = opened | (turned & returns_nothing)
         otherwise = jnp.where(closed, Phase.COMPRESSION, after)
         after = jnp.where(opened, Phase.OPEN, otherwise)
-        x = at.contact[:1]
-        impulses = at.contact[1:]
-        indentation = jnp.where(opened | closed, 0.0, x)
-        kept_impulses = jnp.where(closed, 0.0, impulses)
-        contact = jnp.concatenate([indentation, kept_impulses])
-        return after, at._replace(contact=contact)
+        x = state.contact[:1]
+        impulses = state.contact[1:]
+        changed = opened | closed
+        indentation = jnp.where(changed, 0.0, x)
+        from_now = jnp.where(closed, 0.0, impulses)
+        contact = jnp.concatenate([indentation, from_now])
+        new = state._replace(contact=contact)
+        return after, new
 
     def begins(
-        self, before: Int[Array, "k 1"], after: Int[Array, "k 1"]
+        self, old: Int[Array, "k 1"], new: Int[Array, "k 1"]
     ) -> Bool[Array, "1 1"]:
         """True where the force of a contact sets in: it was open or slack, and is
         compressed.
         """
-        before, after = (self.constants(x).phase[:, None] for x in (before, after))
-        free = (before == Phase.OPEN) | (before == Phase.SLACK)
-        return any_of((after == Phase.COMPRESSION) & free)
+        constants = self.constants(old)
+        old_phase = constants.phase[:, None]
+        constants = self.constants(new)
+        new_phase = constants.phase[:, None]
+        was_open = old_phase == Phase.OPEN
+        was_slack = old_phase == Phase.SLACK
+        free = was_open | was_slack
+        compressed = new_phase == Phase.COMPRESSION
+        return any_of(compressed & free)
 
     def projected(
-        self, const: ContactModes, at: State
+        self, const: ContactModes, state: State
     ) -> tuple[State, Bool[Array, " none"]]:
-        """State without slip of contacts that stick, see `without_slip`; no normal
-        jumps here.
+        """State without slip of contacts that stick, see `without_slip`, as it is
+        without friction; no normal jumps here.
         """
+        none = jnp.zeros(0, bool)
         if self.mu is None:
-            new = at
-        else:
-            new = self.without_slip(const.friction, at)
-        return new, jnp.zeros(0, bool)
+            return state, none
+        return self.without_slip(const.friction, state), none
 
-    def stopped(self, which: Bool[Array, " m"], at: State) -> State:
+    def stopped(self, which: Bool[Array, " m"], state: State) -> State:
         """State without slip of these contacts, see `without_slip`."""
-        one = jnp.ones_like(at.contact_work[0])
-        return self.without_slip(Modes(which, which, one), at, straight=False)
+        one = jnp.ones_like(state.contact_work[0])
+        sticking = Modes(which, which, one)
+        return self.without_slip(sticking, state, straight=False)
 
-    def without_slip(self, modes: Modes, at: State, straight: bool = True) -> State:
+    def without_slip(self, modes: Modes, state: State, straight: bool = True) -> State:
         """State in which contacts that stick have slip 0: `v += M^-1 H p`, the least
         change by M.
 
         Where `straight`, slip across its direction is set to 0, too, of contacts whose
         slip begins or ends in this step.
         """
-        contacts = self.contacts(at)
-        known = with_normal_forces(contacts, jnp.zeros_like(contacts.normal.rate))
-        assert known.tangent is not None
+        contacts = self.contacts(state)
         zero = jnp.zeros_like(contacts.normal.rate)
-        rates = jnp.concatenate([zero, known.tangent.rate])
-        if straight and self.axes is not None:
-            modes = straightened(self.axes, modes, known.tangent.rate)
+        known = with_normal_forces(contacts, zero)
+        assert known.tangent is not None
+        slip = known.tangent.rate
+        rates = jnp.concatenate([zero, slip])
+        held = modes.stick
         if straight:
-            acts = modes.stick | (modes.sign == BEGINS)
-        else:
-            acts = modes.stick
-        held = modes._replace(active=modes.active & acts)
-        p = constraint_impulse(known, self.mu, held, rates)
-        return at._replace(v=at.v + contacts.moved @ p)
+            if self.axes is not None:
+                modes = straightened(self.axes, modes, slip)
+            begins = modes.sign == BEGINS
+            held = modes.stick | begins
+        active = modes.active & held
+        holding = modes._replace(active=active)
+        p = constraint_impulse(known, self.mu, holding, rates)
+        v = state.v + contacts.moved @ p
+        return state._replace(v=v)
 
 
 def loaded(phase: Int[Array, "*m"]) -> Bool[Array, "*m"]:
     """True where the force of a contact acts: in compression and expansion."""
-    return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
+    compressed = phase == Phase.COMPRESSION
+    expands = phase == Phase.EXPANSION
+    return compressed | expands
 
 
 def normal_forces(
-    force: Force, phase: Int[Array, " m"], contacts: Contacts, at: State
+    force: Force, phase: Int[Array, " m"], contacts: Contacts, state: State
 ) -> Float[Array, " m"]:
     """Normal forces F(x, -f') >= 0 [N] of the loaded contacts, 0 of others."""
-    x = at.contact[0]
+    x = state.contact[0]
     inside = jnp.where(x >= 0, x, 0.0)
-    push = force.force(inside, -contacts.normal.rate)
+    closing = -contacts.normal.rate
+    push = force.force(inside, closing)
     pressing = jnp.maximum(push, 0.0)
-    return jnp.where(loaded(phase), pressing, 0.0)
+    acts = loaded(phase)
+    return jnp.where(acts, pressing, 0.0)
 
 
 def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
@@ -380,25 +433,30 @@ def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
     if len(modes) == m:
         return ContactModes(phase, none)
     stick, sign = modes[m:, 0].reshape(2, -1)
-    acts = loaded(phase) & ((stick > 0) | (sign != 0))
+    sticks = stick > 0
+    slides = sign != 0
+    acts = loaded(phase) & (sticks | slides)
     direction_of_slip = sign.astype(none.sign.dtype)
-    return ContactModes(phase, Modes(acts, stick > 0, direction_of_slip))
+    friction = Modes(acts, sticks, direction_of_slip)
+    return ContactModes(phase, friction)
 
 
 def mode_rows(now: ContactModes) -> Int[Array, " rows"]:
     """Rows (3 m) of phases and of friction: phase, stick, sign; both 0 where no
     friction acts.
     """
-    stick_and_sign = now.friction[1:]
-    friction = jnp.stack([x.astype(jnp.int32) for x in stick_and_sign])
-    friction = jnp.where(now.friction.active, friction, 0)
-    phase = now.phase.astype(jnp.int32)
-    return jnp.concatenate([phase, *friction])
+    friction = now.friction
+    stick = jnp.int32(friction.stick)
+    sign = jnp.int32(friction.sign)
+    both = jnp.stack([stick, sign])
+    acting = jnp.where(friction.active, both, 0)
+    phase = jnp.int32(now.phase)
+    return jnp.concatenate([phase, *acting])
 
 
 def compliant_flow(
     problem: MotionProblem,
-    at: State,
+    state: State,
     modes: Int[Array, "k 1"],
     fastest: Float[Array, " s"],
 ) -> CompliantFlow:
@@ -415,37 +473,43 @@ def compliant_flow(
     times = problem.times
     m = problem.contacts
     rubs = mu is not None
-    contacts = contacts_at(system, at.q, at.v, at.t, rubs)
+    contacts = contacts_at(system, state.q, state.v, state.t, rubs)
     scales = contact_scales(force, contacts, fastest)
     axes = None
-    by_depth = jnp.full(m, SNAP * settings.rtol, at.q.dtype)
-    noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
-    by_speed = jnp.maximum(by_depth, noise / scales.speed)
+    dtype = state.q.dtype
+    snap = SNAP * settings.rtol
+    by_depth = jnp.full(m, snap, dtype)
+    largest = jnp.max(jnp.abs(contacts.approach))
+    noise = velocity_noise(settings, largest)
+    noise_of_rate = noise / scales.speed
+    by_speed = jnp.maximum(by_depth, noise_of_rate)
     rounding = jnp.concatenate([by_depth, by_speed])
     if mu is not None:
-        phase, now = contact_modes(modes, at)  # now: modes of friction
-        push = normal_forces(force, phase, contacts, at)
+        phase, friction = contact_modes(modes, state)
+        push = normal_forces(force, phase, contacts, state)
         known = with_normal_forces(contacts, push)
         if settings.spatial:
-            axes = slip_axes(known, mu, now, scales.slip)
-        largest = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
-        by_slip = now.active & ~now.stick
-        rest = rest_acceleration(at.q.dtype)
-        of_slip = jnp.maximum(rest * scales.slip, noise)
-        friction = jnp.where(by_slip, of_slip, rest * largest)
-        rounding = jnp.concatenate([rounding, friction])
+            axes = slip_axes(known, mu, friction, scales.slip)
+        largest_push = jnp.maximum(scales.force, push)
+        largest = friction_acceleration(known, mu, largest_push)
+        by_slip = friction.active & ~friction.stick
+        share = rest_acceleration(dtype)
+        of_cone = share * largest
+        of_slip = jnp.maximum(share * scales.slip, noise)
+        of_friction = jnp.where(by_slip, of_slip, of_cone)
+        rounding = jnp.concatenate([rounding, of_friction])
     rounded = roundings(rounding, times)
-    longest = longest_step(system, times)
-    longest = jnp.minimum(longest, stable_step(force, modes, contacts, at))
-    rows = len(packed(at))
-    blank = jnp.zeros((rows, 1), at.q.dtype)
+    stable = stable_step(force, modes, contacts, state)
+    longest = jnp.minimum(longest_step(system, times), stable)
+    rows = len(packed(state))
+    blank = jnp.zeros((rows, 1), dtype)
     return CompliantFlow(
         system=system,
         rounding=rounded,
         sample=times[0],
         rtol=settings.rtol,
         sizes=blank,
-        like=at,
+        like=state,
         longest=longest,
         mu=mu,
         axes=axes,
@@ -459,12 +523,17 @@ def stiffness_of(
 ) -> Float[Array, " m"]:
     """dF/dx [N/m] of each contact at the indentation x >= 0 and its rate."""
     one = jnp.ones_like(x)
-    _, stiffness = jax.jvp(lambda x: force.force(x, rate), (x,), (one,))
+
+    def push(x: Float[Array, " m"]) -> Float[Array, " m"]:
+        """F [N] at this indentation."""
+        return force.force(x, rate)
+
+    _, stiffness = jax.jvp(push, (x,), (one,))
     return stiffness
 
 
 def stable_step(
-    force: Force, modes: Int[Array, "k 1"], contacts: Contacts, at: State
+    force: Force, modes: Int[Array, "k 1"], contacts: Contacts, state: State
 ) -> Float[Array, ""]:
     """Longest stable step [s] with the stiffness dF/dx and damping dF/dx' of loaded
     contacts.
@@ -472,22 +541,31 @@ def stable_step(
     Equation: `STABLE / max(omega, delta)`, bounds by row sums of |W|:
     `omega^2 = max_i sum_j |W_ij| dF_j/dx`, `delta = max_i sum_j |W_ij| dF_j/dx'`.
     """
-    x = at.contact[0]
+    indentation = state.contact[0]
     rate = -contacts.normal.rate
-    m = len(at.contact[0])
+    m = len(indentation)
     phase = modes[:m, 0]
-    x = jnp.where(x >= 0, x, 0.0)
+    inside = indentation >= 0
+    x = jnp.where(inside, indentation, 0.0)
     stiffness = stiffness_of(force, x, rate)
     one = jnp.ones_like(x)
-    _, damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))
+
+    def push(rate: Float[Array, " m"]) -> Float[Array, " m"]:
+        """F [N] at this rate of indentation."""
+        return force.force(x, rate)
+
+    _, damping = jax.jvp(push, (rate,), (one,))
     steep = unloading(force, phase, stiffness)
-    both = jnp.stack([steep, damping], axis=1)
-    both = jnp.where(loaded(phase)[:, None], both, 0.0)
+    slopes = jnp.stack([steep, damping], axis=1)
+    acts = loaded(phase)[:, None]
+    acting = jnp.where(acts, slopes, 0.0)
     w = jnp.abs(contacts.delassus[:m, :m])
-    square, rate = jnp.max(w @ jnp.abs(both), axis=0)
-    frequency = jnp.sqrt(square)
-    fastest = jax.lax.stop_gradient(jnp.maximum(frequency, rate))
-    return quotient(STABLE, fastest, where=fastest > 0, otherwise=jnp.inf)
+    row_sums = w @ jnp.abs(acting)
+    square, delta = jnp.max(row_sums, axis=0)
+    omega = jnp.sqrt(square)
+    fastest = jax.lax.stop_gradient(jnp.maximum(omega, delta))
+    moves = fastest > 0
+    return quotient(STABLE, fastest, where=moves, otherwise=jnp.inf)
 
 
 def unloading(
@@ -501,5 +579,7 @@ def unloading(
     if force.bistiffness is None:
         return rate
     restitution = force.bistiffness.restitution
-    e = jnp.where(restitution > 0, restitution, 1.0)
-    return jnp.where(phase == Phase.EXPANSION, rate / e**2, rate)
+    returns = restitution > 0
+    e = jnp.where(returns, restitution, 1.0)
+    expands = phase == Phase.EXPANSION
+    return jnp.where(expands, rate / e**2, rate)

@@ -46,7 +46,12 @@ def base_velocity(system: System, t: Float[Array, ""]) -> Float[Array, " n"] | N
     if system.base is None:
         return None
     one = jnp.ones_like(t)
-    _, rate = jax.jvp(lambda s: _displaced(system, s), (t,), (one,))
+
+    def displaced(s: Float[Array, ""]) -> Float[Array, " n"]:
+        """`B y_b(s)` [m]."""
+        return _displaced(system, s)
+
+    _, rate = jax.jvp(displaced, (t,), (one,))
     return rate
 
 
@@ -65,7 +70,8 @@ def _displaced(system: System, t: Float[Array, ""]) -> Float[Array, " n"]:
     """Displacement `B y_b(t)` of the base in all coordinates [m]."""
     assert system.base is not None
     assert system.base_directions is not None
-    return system.base_directions @ jnp.atleast_1d(system.base(t))
+    y_b = jnp.atleast_1d(system.base(t))
+    return system.base_directions @ y_b
 
 
 @full_precision
@@ -77,7 +83,8 @@ def seen_from_base(
     """
     if system.base is None:
         return q
-    return system.body.moved(q, -_displaced(system, t))
+    displacement = _displaced(system, t)
+    return system.body.moved(q, -displacement)
 
 
 def gaps(
@@ -85,7 +92,8 @@ def gaps(
 ) -> Float[Array, " m"]:
     """Gaps f [m] of the configuration seen from the base."""
     seen = seen_from_base(system, q, t)
-    return jnp.atleast_1d(system.body.gap_function(seen))
+    f = system.body.gap_function(seen)
+    return jnp.atleast_1d(f)
 
 
 def is_pile(system: System) -> bool:
@@ -102,7 +110,9 @@ def recorded_gaps(
     alone.
     """
     if is_pile(system):
-        return system.body.least_gap(seen_from_base(system, q, t))[None]
+        seen = seen_from_base(system, q, t)
+        smallest = system.body.least_gap(seen)
+        return smallest[None]
     return gaps(system, q, t)
 
 
@@ -121,36 +131,38 @@ def kinematics(
     body = system.body
 
     def tangents(
-        at: Float[Array, " nq"],
+        seen: Float[Array, " nq"],
     ) -> tuple[Float[Array, " t"], Float[Array, "n t"]]:
         """Tangents H (n, t), with 0 for the displacements along them."""
-        h = body.tangents(at)
+        h = body.tangents(seen)
         assert h is not None
-        return jnp.zeros_like(h[0]), h
+        first = h[0]
+        return jnp.zeros_like(first), h
 
     if not body.has_formulas:
         normal = _differentiated(system, q, v, t)
-        return normal, _along(system, q, v, t, tangents) if friction else None
+        if not friction:
+            return normal, None
+        return normal, _along(system, q, v, t, tangents)
 
     def all_directions(
-        at: Float[Array, " nq"],
+        seen: Float[Array, " nq"],
     ) -> tuple[Float[Array, " m"], Float[Array, "n d"]]:
         """Gaps f (m,), and directions [N, H]: normals, then tangents where there is
         friction.
         """
-        known = body.directions(at, friction)
-        each = [x for x in known[1:] if x is not None]
-        return known.gaps, jnp.concatenate(each, axis=1)
+        f, *directions = body.directions(seen, friction)
+        known = [x for x in directions if x is not None]
+        return f, jnp.concatenate(known, axis=1)
 
-    both = _along(system, q, v, t, all_directions)
-    m = len(both.value)
-    gradient = both.gradient[:, :m]
-    normal = Kinematics(both.value, both.rate[:m], both.drift[:m], gradient)
+    f, rate, drift, gradient = _along(system, q, v, t, all_directions)
+    m = len(f)
+    normal = Kinematics(f, rate[:m], drift[:m], gradient[:, :m])
     if not friction:
         return normal, None
-    slip = both.rate[m:]
+    slip = rate[m:]
     zero = jnp.zeros_like(slip)
-    tangent = Kinematics(zero, slip, both.drift[m:], both.gradient[:, m:])
+    tangent = Kinematics(zero, slip, drift[m:], gradient[:, m:])
     return normal, tangent
 
 
@@ -160,11 +172,13 @@ def _differentiated(
     """Kinematics of the gaps by differentiation along (v, 1): f, f' and
     `drift = f''`.
     """
-    here, along = _in_time(v, t)
+    point, along = _in_time(v, t)
+    body = system.body
 
     def value_at(u: Float[Array, " n"], s: Float[Array, ""]) -> Float[Array, " m"]:
         """Gaps f [m] after the displacement u from q and the time s from t."""
-        return gaps(system, system.body.nearby(q, u), t + s)
+        displaced = body.nearby(q, u)
+        return gaps(system, displaced, t + s)
 
     def gaps_and_rates(
         u: Float[Array, " n"], s: Float[Array, ""]
@@ -174,8 +188,11 @@ def _differentiated(
         """
         return jax.jvp(value_at, (u, s), along)
 
-    (value, rate), (_, drift) = jax.jvp(gaps_and_rates, here, along)
-    normals = system.body.normals(seen_from_base(system, q, t))
+    here, change = jax.jvp(gaps_and_rates, point, along)
+    value, rate = here
+    _, drift = change
+    seen = seen_from_base(system, q, t)
+    normals = body.normals(seen)
     return Kinematics(value, rate, drift, normals)
 
 
@@ -188,8 +205,10 @@ def _in_time(
     Only the rate depends on v, so that different velocities at one q share all other
     operations.
     """
-    point = jnp.zeros_like(v), jnp.zeros_like(t)
-    return point, (v, jnp.ones_like(t))
+    u = jnp.zeros_like(v)
+    s = jnp.zeros_like(t)
+    one = jnp.ones_like(t)
+    return (u, s), (v, one)
 
 
 def _along(
@@ -207,7 +226,7 @@ def _along(
     `directions`: configuration seen from the base -> values (m,), which are passed on,
     and D.
     """
-    here, along = _in_time(v, t)
+    point, along = _in_time(v, t)
 
     def rates(
         u: Float[Array, " n"], s: Float[Array, ""]
@@ -215,13 +234,17 @@ def _along(
         """Rates `D^T (v - B y_b')` after the displacement u and the time s; values and
         D there.
         """
+        time = t + s
         displaced = system.body.nearby(q, u)
-        value, h = directions(seen_from_base(system, displaced, t + s))
-        carried = base_velocity(system, t + s)
-        rate = h.T @ (v if carried is None else v - carried)
-        return rate, (value, h)
+        seen = seen_from_base(system, displaced, time)
+        value, h = directions(seen)
+        carried = base_velocity(system, time)
+        relative = v
+        if carried is not None:
+            relative = v - carried
+        return h.T @ relative, (value, h)
 
-    rate, drift, (value, h) = jax.jvp(rates, here, along, has_aux=True)
+    rate, drift, (value, h) = jax.jvp(rates, point, along, has_aux=True)
     return Kinematics(value, rate, drift, h)
 
 
@@ -235,8 +258,10 @@ def definite(mass: Mass) -> Bool[Array, ""]:
     if mass.ndim == 1:
         return jnp.all(mass > 0)
     mass = jax.lax.stop_gradient(mass)
-    solved = solve_mass_matrix(mass, mass[:, 0])
-    return jnp.all(jnp.isfinite(solved))
+    any_load = mass[:, 0]
+    solved = solve_mass_matrix(mass, any_load)
+    finite = jnp.isfinite(solved)
+    return jnp.all(finite)
 
 
 @full_precision
@@ -245,7 +270,11 @@ def kinetic(
 ) -> Float[Array, ""]:
     """`T = v^T M v / 2` [J]."""
     mass = mass_at(system, q)
-    return 0.5 * v @ (mass * v if mass.ndim == 1 else mass @ v)
+    if mass.ndim == 1:
+        momentum = mass * v
+    else:
+        momentum = mass @ v
+    return 0.5 * v @ momentum
 
 
 def potential(system: System, q: Float[Array, " nq"]) -> Float[Array, ""]:
@@ -263,8 +292,8 @@ def user_force(
     """
     if system.force is None:
         return jnp.zeros_like(v)
-    force = jnp.asarray(system.force(q, v, t))
-    return force.astype(v.dtype)
+    force = system.force(q, v, t)
+    return jnp.asarray(force).astype(v.dtype)
 
 
 def free_acceleration(
@@ -279,8 +308,10 @@ def free_acceleration(
 
     `force` is F, `mass` is M at q.
     """
+    body = system.body
     total = force
     if system.potential is not None:
         gradient = jax.grad(system.potential)(q)
-        total = total - system.body.pulled(q, gradient)
-    return solve_mass_matrix(mass, total + system.body.inertial_force(q, v))
+        total = total - body.pulled(q, gradient)
+    total = total + body.inertial_force(q, v)
+    return solve_mass_matrix(mass, total)

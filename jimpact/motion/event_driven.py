@@ -83,8 +83,9 @@ def empty_checkpoint(
     q: Float[Array, " nq"], v: Float[Array, " n"], contacts: int, samples: int
 ) -> Float[Array, " size"]:
     """`Past.numbers` of a motion that begins: zeros, enough for a `_Checkpoint`."""
-    state = q.shape[0] + v.shape[0] + 2 * contacts + 3
-    size = (samples + 2) * state + ROOM * (contacts + 2)
+    state = len(q) + len(v) + 2 * contacts + 3
+    records = (samples + 2) * state
+    size = records + ROOM * (contacts + 2)
     return jnp.asarray(np.zeros(size, q.dtype))
 
 
@@ -97,18 +98,21 @@ def event_driven(
     Where there is a `problem.past`, also the numbers of the next one, of the run that
     goes on after the last of `max_events`; else None.
     """
-    problem = problem._replace(law=forward_only(problem.law))
-    return course_of(problem, problem.start, lambda problem: _run(problem, max_events))
+    without_derivatives = forward_only(problem.law)
+    problem = problem._replace(law=without_derivatives)
+    run = partial(_run, max_events)
+    return course_of(problem, problem.start, run)
 
 
 # ------------------------------------------------------------------------------ the run
 
 
-def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
+def _run(max_events: int, problem: MotionProblem) -> MotionEnd:
     """Pass after pass until the last sample, a failure, or one event too many."""
+    past = problem.past
     start = _begin(problem, max_events)
-    if problem.past is not None:
-        start = _unpack_checkpoint(start, problem.past.numbers)
+    if past is not None:
+        start = _unpack_checkpoint(start, past.numbers)
 
     def one(problem: MotionProblem, run: _EventRun) -> _EventRun:
         """Run after one pass: its event if one waits and is due, then a step unless one
@@ -117,58 +121,75 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
         on = goes_on(problem, run)
         waiting = on & run.waits
         flying = on & ~run.waits
-        waiting_lanes = over_lanes(waiting.astype(jnp.int32))
-        due = waiting_lanes >= over_lanes(flying.astype(jnp.int32))
+        waiting_lanes = over_lanes(jnp.int32(waiting))
+        flying_lanes = over_lanes(jnp.int32(flying))
+        due = waiting_lanes >= flying_lanes
         run = _resolved(problem, max_events, run, waiting, due)
-        return _flown(problem, run, goes_on(problem, run) & ~run.waits)
+        still = goes_on(problem, run)
+        flies = still & ~run.waits
+        return _flown(problem, run, flies)
 
-    # over all lanes, so that `jax.lax.cond` in a pass is not turned into a selection
-    last = until_over(
-        lambda problem, run: any_lane(goes_on(problem, run)), one, problem, start
-    )
+    def continues(problem: MotionProblem, run: _EventRun) -> Bool[Array, ""]:
+        """True while a lane goes on: over all lanes, so that `jax.lax.cond` in a pass
+        is not turned into a selection.
+        """
+        return any_lane(goes_on(problem, run))
+
+    last = until_over(continues, one, problem, start)
     next_past = None
-    if problem.past is not None:
-        next_past = _pack_checkpoint(last, problem.past.numbers.shape[0])
+    if past is not None:
+        size = past.numbers.shape[0]
+        next_past = _pack_checkpoint(last, size)
     end = end_of(problem, last, last.smooth, next_past)
-    reported = last.several & (end.status == CODE["ok"])
-    code = jnp.where(reported, CODE["several_outcomes"], end.status)
-    status = code.astype(jnp.int32)
-    return end._replace(status=status)
+    status = end.status
+    ok = status == CODE["ok"]
+    reported = last.several & ok
+    code = jnp.where(reported, CODE["several_outcomes"], status)
+    return end._replace(status=jnp.int32(code))
 
 
 def _checkpoint(run: _EventRun) -> _Checkpoint:
     """The fields of a run that the next one goes on from."""
     names = (name for name in _Checkpoint._fields if name != "samples")
-    own = {name: getattr(run, name) for name in names}
-    return _Checkpoint(**own, samples=run.table.samples)
+    fields = {name: getattr(run, name) for name in names}
+    samples = run.table.samples
+    return _Checkpoint(**fields, samples=samples)
 
 
 def _pack_checkpoint(run: _EventRun, size: int) -> Float[Array, " size"]:
     """Numbers of `Past`: 1, the leaves of the checkpoint in turn, zeros up to
     `size`.
     """
-    leaves = jax.tree.leaves(_checkpoint(run))
-    parts = [jnp.ravel(x).astype(run.allowed.dtype) for x in leaves]
-    one = jnp.ones(1, run.allowed.dtype)
+    checkpoint = _checkpoint(run)
+    leaves = jax.tree.leaves(checkpoint)
+    dtype = run.allowed.dtype
+    one = jnp.ones(1, dtype)
+    parts = [jnp.ravel(x).astype(dtype) for x in leaves]
     flat = jnp.concatenate([one, *parts])
-    return jnp.pad(flat, (0, size - flat.shape[0]))
+    left = size - len(flat)
+    return jnp.pad(flat, (0, left))
 
 
 def _unpack_checkpoint(start: _EventRun, past: Float[Array, " size"]) -> _EventRun:
     """Run that goes on from the numbers of `Past`, or `start` where their first one is
     0.
     """
-    leaves, tree = jax.tree.flatten(_checkpoint(start))
-    ends = np.cumsum([1] + [x.size for x in leaves])
+    new = _checkpoint(start)
+    leaves, tree = jax.tree.flatten(new)
+    sizes = [x.size for x in leaves]
+    ends = np.cumsum([1, *sizes])
     parts = jnp.split(past, ends)[1:-1]
-    known = [x.reshape(like.shape).astype(like.dtype) for x, like in zip(parts, leaves)]
+    pairs = zip(parts, leaves)
+    known = [x.reshape(like.shape).astype(like.dtype) for x, like in pairs]
     on = past[0] > 0
     past_checkpoint = jax.tree.unflatten(tree, known)
-    own = choose(on, past_checkpoint, _checkpoint(start))._asdict()
-    table = start.table._replace(samples=own.pop("samples"))
+    checkpoint = choose(on, past_checkpoint, new)
+    fields = checkpoint._asdict()
+    samples = fields.pop("samples")
+    table = start.table._replace(samples=samples)
     code = jnp.where(on, CODE["ok"], start.status)
-    status = code.astype(jnp.int32)
-    return start._replace(**own, table=table, status=status)
+    status = jnp.int32(code)
+    return start._replace(**fields, table=table, status=status)
 
 
 def _begin(problem: MotionProblem, max_events: int) -> _EventRun:
@@ -183,19 +204,24 @@ def _begin(problem: MotionProblem, max_events: int) -> _EventRun:
         margins = 2 * m
     else:
         margins = m
-    rows = encoded(no_modes(m, dtype))
+    modes = no_modes(m, dtype)
+    rows = encoded(modes)
     flight = first_flight(system, state, rows, margins, times)
     zero = jnp.zeros((), dtype)
     no = jnp.asarray(False)
-    status = status_at_start(system, state, times[-1], settings.closed_below)
+    end = times[-1]
+    status = status_at_start(system, state, end, settings.closed_below)
     if mu is not None:
-        known = jnp.all(jnp.isfinite(mu))
+        finite = jnp.isfinite(mu)
+        known = jnp.all(finite)
         code = jnp.where(known, status, CODE["not_finite"])
-        status = code.astype(jnp.int32)
+        status = jnp.int32(code)
+    after_v = q0.size + v0.size
+    rows_of_state = packed(state)
     return _EventRun(
         flight=flight,
         struck=jnp.zeros(m, bool),
-        allowed=packed(state)[q0.size + v0.size :, 0],
+        allowed=rows_of_state[after_v:, 0],
         waits=~no,
         approach=zero,
         several=no,
@@ -224,8 +250,8 @@ def _resolved(
         run: _EventRun,
     ) -> tuple[_EventRun, Float[Array, " w"], Int[Array, " marks"]]:
         """The run as it is, and rows of zeros."""
-        no_numbers = jnp.zeros_like(run.table.events[0])
-        no_marks = jnp.zeros_like(run.table.marks[0])
+        no_numbers = jnp.zeros_like(table.events[0])
+        no_marks = jnp.zeros_like(table.marks[0])
         return run, no_numbers, no_marks
 
     table = run.table
@@ -234,8 +260,11 @@ def _resolved(
     light = run._replace(table=first_rows)
     now = partial(_after_event, problem, max_events, waiting)
     new, numbers, marks = jax.lax.cond(due, now, later, light)
-    row = jnp.where(new.event_count > run.event_count, run.event_count, max_events)
-    return new._replace(table=table.with_event(numbers, marks, row))
+    count = run.event_count
+    written = new.event_count > count
+    row = jnp.where(written, count, max_events)
+    written_table = table.with_event(numbers, marks, row)
+    return new._replace(table=written_table)
 
 
 def _after_event(
@@ -270,31 +299,37 @@ def _after_event(
     most = jnp.asarray(max_events)
     if problem.past is not None:
         most = jnp.minimum(problem.past.most, max_events)
-    full = (run.event_count >= most) & happened  # no row is left
+    count = run.event_count
+    full = (count >= most) & happened  # no row is left
     code = jnp.where(full, CODE["max_events"], outcome.status)
-    status = code.astype(jnp.int32)
+    status = jnp.int32(code)
     written = waiting & happened & ~full
     state = outcome.after.state
-    aim = flight.aim._replace(modes=encoded(outcome.modes))
+    rows = encoded(outcome.modes)
+    aim = flight.aim._replace(modes=rows)
     no_event = jnp.zeros_like(flight.event)
     ready = flight._replace(state=state, aim=aim, event=no_event)
+    struck = outcome.contacts & outcome.strikes
+    allowed = allowed_errors(system, settings, state)
     new = run._replace(
         flight=toward_sample(ready, problem.times, flight.free),
-        struck=run.struck | (outcome.contacts & outcome.strikes),
-        allowed=jax.lax.stop_gradient(allowed_errors(system, settings, state)),
+        struck=run.struck | struck,
+        allowed=jax.lax.stop_gradient(allowed),
         waits=outcome.approach > 0,
         approach=outcome.approach,
         several=run.several | outcome.several,
         scales=outcome.scales,
-        event_count=run.event_count + written.astype(jnp.int32),
+        event_count=count + jnp.int32(written),
         status=status,
     )
     codes = jnp.stack([outcome.kind, outcome.code])
-    contacts = outcome.contacts.astype(jnp.int32)
-    marks = jnp.concatenate([codes.astype(jnp.int32), contacts])
+    codes = jnp.int32(codes)
+    contacts = jnp.int32(outcome.contacts)
+    marks = jnp.concatenate([codes, contacts])
     numbers = event_numbers(old, outcome.after)
     # an event without a row is not resolved
-    new = choose(full, run._replace(status=status), new)
+    unresolved = run._replace(status=status)
+    new = choose(full, unresolved, new)
     return choose(waiting, new, run), numbers, marks
 
 
@@ -308,13 +343,15 @@ def _flown(problem: MotionProblem, run: _EventRun, flies: Bool[Array, ""]) -> _E
     times = problem.times
     # the last row of samples is discarded
     begin = run.flight
-    last = times.shape[0]
-    modes = decoded(begin.aim.modes, begin.state.q.dtype)
-    flow = flow_of(system, mu, settings, modes, run.scales, times, begin.state)
+    state = begin.state
+    last = len(times)
+    modes = decoded(begin.aim.modes, state.q.dtype)
+    flow = flow_of(system, mu, settings, modes, run.scales, times, state)
     flight, _ = one_pass(flow, settings, run.allowed, times, begin, flies)
     row = jnp.where(flies, begin.sample, last)
     table = run.table.with_sample(flight.state, row)
     counts = jnp.stack([flight.sample, run.event_count])
-    waits = run.waits | (flies & jnp.any(flight.event))
+    fired = jnp.any(flight.event)
+    waits = run.waits | (flies & fired)
     smooth = jnp.where(flight.jumped, run.smooth, counts)
     return run._replace(flight=flight, waits=waits, smooth=smooth, table=table)

@@ -118,7 +118,8 @@ def speed_of(energy: Float[Array, ""], w: Float[Array, " k"]) -> Float[Array, ""
 
     `w` is the diagonal W_jj of the Delassus matrix.
     """
-    return jnp.sqrt(2 * energy * jnp.max(w))
+    largest = jnp.max(w)
+    return jnp.sqrt(2 * energy * largest)
 
 
 class Scales(NamedTuple):
@@ -147,10 +148,11 @@ def contact_margins(
     `below`: gaps <= 0 that the step begins with [m]. `slip`: directions, as in
     `forces`.
     """
-    m = modes.active.shape[0]
     force = forces(contacts, mu, modes, slip)
     w = jnp.diagonal(contacts.delassus)
-    slack = rest_acceleration(w.dtype) * scales.acceleration
+    m = len(modes.active)
+    dtype = w.dtype
+    slack = rest_acceleration(dtype) * scales.acceleration
     gap = contacts.normal.value - below
     push = force.normal * w[:m] + slack
     normal = jnp.where(modes.active, push, gap)
@@ -158,12 +160,13 @@ def contact_margins(
         return normal
     # sliding ends where slip does, and where its forces stop to exist: both may be in
     # one step else its product with slip is 0
-    slides = any_lane(jnp.any(modes.active & ~modes.stick))
-    one = jnp.ones((), w.dtype)
+    sliding = modes.active & ~modes.stick
+    slides = any_lane(jnp.any(sliding))
+    one = jnp.ones((), dtype)
     regular = jax.lax.cond(
         slides, lambda: regularity(contacts, mu, modes, slip), lambda: one
     )
-    lasts = regular - precision(w.dtype).root
+    lasts = regular - precision(dtype).root
     friction = friction_margins(contacts, mu, modes, force, lasts, slack, scales.speed)
     return jnp.concatenate([normal, friction])
 
@@ -184,7 +187,8 @@ def friction_margins(
     slide, see `slip_margins`, with `lasts` what is left of the regularity until forces
     count as singular; 1 of open ones.
     """
-    cone = cone_margins(contacts, mu, force) + slack
+    to_rim = cone_margins(contacts, mu, force)
+    cone = to_rim + slack
     ends = slip_margins(contacts, mu, modes, force, lasts, speed_scale)
     held = jnp.where(modes.stick, cone, ends)
     return jnp.where(modes.active, held, 1.0)
@@ -243,13 +247,15 @@ class MotionFlow(eqx.Module, stepper.Flow):
         return jnp.ones((1, 1), self.sizes.dtype)
 
     def from_margins(
-        self, margins: Float[Array, " k"], at: State
+        self, margins: Float[Array, " k"], state: State
     ) -> Float[Array, "margins 1"]:
         """Rows of margins, that of the next sample `t_sample - t` last, over their
         rounding.
         """
-        time_left = self.sample - at.t
-        return (jnp.append(margins, time_left) / self.rounding)[:, None]
+        time_left = self.sample - state.t
+        with_time = jnp.append(margins, time_left)
+        scaled = with_time / self.rounding
+        return scaled[:, None]
 
     def errors_of_error_only_rows(
         self,
@@ -264,21 +270,22 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """
         if self.axes is None:
             return []
-        return [turning_errors(self.axes, settings.rtol, self.speed_scale)]
+        errors = turning_errors(self.axes, settings.rtol, self.speed_scale)
+        return [errors]
 
     @property
     @abc.abstractmethod
     def speed_scale(self) -> Float[Array, ""]:
         """Largest speed [m/s] of the motion so far, of which small slip is a share."""
 
-    def contacts(self, at: State) -> Contacts:
+    def contacts(self, state: State) -> Contacts:
         """Contact space at this state, with tangents along the axes of the step."""
         if self.axes is None:
             along = None
         else:
             along = self.axes.along
         rubs = self.mu is not None
-        return contacts_at(self.system, at.q, at.v, at.t, rubs, along)
+        return contacts_at(self.system, state.q, state.v, state.t, rubs, along)
 
     def slip(self, modes: Modes, contacts: Contacts) -> Float[Array, "m 2"] | None:
         """Directions of slip in space, in the axes of the step; None in the plane."""
@@ -287,22 +294,29 @@ class MotionFlow(eqx.Module, stepper.Flow):
         return slip_within(self.axes, modes, contacts.tangent.rate)
 
     def rows_of(
-        self, rates: State, at: State, modes: Modes, contacts: Contacts, force: Forces
+        self,
+        rates: State,
+        state: State,
+        modes: Modes,
+        contacts: Contacts,
+        force: Forces,
     ) -> list[Float[Array, "rows 1"]]:
         """Rates (rows, 1) of the state, and in space those of the logarithms of
         slip.
         """
-        rows = [self.regular(rates, at)]
+        rows = [self.regular(rates, state)]
         if self.axes is not None:
             growth = log_rates(self.axes, modes, contacts, force)
             rows.append(growth[:, None])
         return rows
 
-    def projected(self, const: Any, at: State) -> tuple[State, Bool[Array, " jumps"]]:
+    def projected(
+        self, const: Any, state: State
+    ) -> tuple[State, Bool[Array, " jumps"]]:
         """The state, moved back onto the constraints of its modes; true where a normal
         jumped.
         """
-        return at, jnp.zeros(0, bool)
+        return state, jnp.zeros(0, bool)
 
     def switch(
         self,
@@ -322,12 +336,14 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """False: the loop of the motion decides when it ends."""
         return jnp.zeros((1, 1), bool)
 
-    def regular(self, rates: State, at: State) -> Float[Array, "rows 1"]:
+    def regular(self, rates: State, state: State) -> Float[Array, "rows 1"]:
         """Rates (rows, 1) of the state; NaN where M is not positive definite."""
-        if callable(self.system.mass):
-            positive = definite(mass_at(self.system, at.q))
-            return jnp.where(positive, packed(rates), jnp.nan)
-        return packed(rates)
+        rows = packed(rates)
+        if not callable(self.system.mass):
+            return rows
+        mass = mass_at(self.system, state.q)
+        positive = definite(mass)
+        return jnp.where(positive, rows, jnp.nan)
 
 
 class MechanicalFlow(MotionFlow):
@@ -351,7 +367,8 @@ class MechanicalFlow(MotionFlow):
         """Gaps by integration (m), too: steps follow a base that moves faster than the
         body.
         """
-        return self.like.contact_work.shape[1] + super().error_only_rows
+        m = self.like.contact_work.shape[1]
+        return m + super().error_only_rows
 
     @property
     def speed_scale(self) -> Float[Array, ""]:
@@ -375,10 +392,13 @@ class MechanicalFlow(MotionFlow):
         else:
             of_u = h * jnp.abs(state.v)
         normal, _ = kinematics(self.system, state.q, state.v, state.t)
-        of_rate = jnp.abs(normal.value) + h * jnp.abs(normal.rate)
-        of_gap = of_rate + jnp.abs(normal.gradient).T @ of_u
-        errors = settings.atol + settings.rtol * of_gap
-        return [errors, *super().errors_of_error_only_rows(settings, state, h, of_q)]
+        f = jnp.abs(normal.value)
+        rate = jnp.abs(normal.rate)
+        gradient = jnp.abs(normal.gradient)
+        sizes = f + h * rate + gradient.T @ of_u
+        errors = settings.atol + settings.rtol * sizes
+        others = super().errors_of_error_only_rows(settings, state, h, of_q)
+        return [errors, *others]
 
     def constants(self, modes: Int[Array, "k 1"]) -> Modes:
         """Modes from their rows."""
@@ -393,95 +413,109 @@ class MechanicalFlow(MotionFlow):
         `F . v`, `lambda_t . u` and that of the base; then gap velocities of open
         contacts, in space `(ln |u|)'`.
         """
-        at = unpacked(self.like, y)
-        contacts = self.contacts(at)
+        state = unpacked(self.like, y)
+        system = self.system
+        contacts = self.contacts(state)
         slip = self.slip(const, contacts)
         force = forces(contacts, self.mu, const, slip)
-        friction, base = contact_powers(self.system, contacts, force, at.t)
-        push = user_force(self.system, at.q, at.v, at.t)
-        power = push @ at.v
+        friction, base = contact_powers(system, contacts, force, state.t)
+        no_normal = jnp.zeros_like(friction)
+        push = user_force(system, state.q, state.v, state.t)
+        power = push @ state.v
         rates = State(
-            q=self.system.body.rates(at.q, at.v),
+            q=system.body.rates(state.q, state.v),
             v=force.acceleration,
-            t=jnp.ones_like(at.t),
+            t=jnp.ones_like(state.t),
             work=power,
             base_work=base,
-            contact_work=jnp.stack([jnp.zeros_like(friction), friction]),
-            contact=jnp.zeros_like(at.contact),
+            contact_work=jnp.stack([no_normal, friction]),
+            contact=jnp.zeros_like(state.contact),
         )
-        by_steps = jnp.where(const.active, 0.0, contacts.normal.rate)
+        gamma = contacts.normal.rate
+        by_steps = jnp.where(const.active, 0.0, gamma)
         gaps_by_steps = by_steps[:, None]
-        rows, *logs = self.rows_of(rates, at, const, contacts, force)
+        rows, *logs = self.rows_of(rates, state, const, contacts, force)
         return jnp.concatenate([rows, gaps_by_steps, *logs])
 
     def margins(
         self, const: Modes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
     ) -> Float[Array, "margins 1"]:
         """Rows of `contact_margins`, and of the time left to the next sample."""
-        at = unpacked(self.like, y)
-        contacts = self.contacts(at)
+        state = unpacked(self.like, y)
+        contacts = self.contacts(state)
         slip = self.slip(const, contacts)
         margins = contact_margins(
             contacts, self.mu, const, self.scales, self.below, slip
         )
-        return self.from_margins(margins, at)
+        return self.from_margins(margins, state)
 
-    def projected(self, const: Modes, at: State) -> tuple[State, Bool[Array, " m"]]:
+    def projected(self, const: Modes, state: State) -> tuple[State, Bool[Array, " m"]]:
         """Gaps, gap velocities and slip that the modes hold set to 0: the least change
         by M.
 
         Equation: `q += M^-1 D p_q`, `v += M^-1 D p_v` with `W p = -(f, rates)` in held
         rows. A persistent contact whose gap velocity exceeds JUMP of the speed after
         the step has got another normal: then nothing is changed. True (second result)
-        where that is so.
+        where that is so. In space slip across its direction is set to 0, too, of
+        contacts whose slip begins or ends.
         """
-        contacts = self.contacts(at)
+        contacts = self.contacts(state)
         value = contacts.normal.value
         rate = contacts.normal.rate
-        most = max(not_rounding(JUMP, rate.dtype), MORE_THAN_STEPS * self.rtol)
+        by_steps = MORE_THAN_STEPS * self.rtol
+        share = max(not_rounding(JUMP, rate.dtype), by_steps)
         # a motion that began at rest had no speed before this step
-        energy = kinetic(self.system, at.q, at.v)
+        energy = kinetic(self.system, state.q, state.v)
         w = jnp.diagonal(contacts.delassus)
         by_energy = speed_of(energy, w[: len(rate)])
         speed = jnp.maximum(self.scales.speed, by_energy)
-        jumps = const.active & (jnp.abs(rate) > most * speed)
+        turned = jnp.abs(rate) > share * speed
+        jumps = const.active & turned
         if contacts.tangent is not None:  # tangentially only velocities drift
-            zero = jnp.zeros_like(contacts.tangent.rate)
+            slip = contacts.tangent.rate
+            zero = jnp.zeros_like(slip)
             value = jnp.concatenate([value, zero])
-            rate = jnp.concatenate([rate, contacts.tangent.rate])
+            rate = jnp.concatenate([rate, slip])
             if self.axes is not None:
-                const = straightened(self.axes, const, contacts.tangent.rate)
-        both = jnp.stack([value, rate], axis=1)
-        p = constraint_impulse(contacts, self.mu, const, both)
+                const = straightened(self.axes, const, slip)
+        drift = jnp.stack([value, rate], axis=1)
+        p = constraint_impulse(contacts, self.mu, const, drift)
         move = contacts.moved @ p
         of_gaps, of_rates = move.T
-        q = self.system.body.moved(at.q, of_gaps)
-        back = at._replace(q=q, v=at.v + of_rates)
-        return choose(jnp.any(jumps), at, back), jumps
+        q = self.system.body.moved(state.q, of_gaps)
+        v = state.v + of_rates
+        back = state._replace(q=q, v=v)
+        jumped = jnp.any(jumps)
+        return choose(jumped, state, back), jumps
 
 
 def packed(state: State) -> Float[Array, "rows 1"]:
     """Rows of a state, in the order of its fields."""
-    return ravel_pytree(state)[0][:, None]
+    flat, _ = ravel_pytree(state)
+    return flat[:, None]
 
 
 def unpacked(like: State, y: Float[Array, "rows 1"]) -> State:
     """State from its rows; rows after them (`error_only_rows`) are left out."""
     flat, back = ravel_pytree(like)
-    return back(y[: len(flat), 0])
+    n = len(flat)
+    return back(y[:n, 0])
 
 
 def decoded(rows: Int[Array, "k 1"], dtype: Any) -> Modes:
     """Modes from their rows (3 m, 1), see `encoded`."""
     active, stick, sign = rows[:, 0].reshape(3, -1)
-    return Modes(active > 0, stick > 0, sign.astype(dtype))
+    persistent = active > 0
+    sticks = stick > 0
+    return Modes(persistent, sticks, sign.astype(dtype))
 
 
 def encoded(modes: Modes) -> Int[Array, "k 1"]:
     """Modes as rows (3 m, 1) of whole numbers: `active`, `stick`, `sign`."""
     rows = [modes.active, modes.stick, modes.sign]
-    whole = [x.astype(jnp.int32) for x in rows]
-    return jnp.concatenate(whole)[:, None]
+    whole = [jnp.int32(x) for x in rows]
+    column = jnp.concatenate(whole)
+    return column[:, None]
 
 
 class Flight(NamedTuple):
@@ -508,7 +542,9 @@ def longest_step(system: System, targets: Float[Array, " S"]) -> Float[Array, ""
     """
     if system.base is None and system.force is None:
         return jnp.full((), jnp.inf, targets.dtype)
-    return jax.lax.stop_gradient(targets[-1] - targets[0]) / LOOKS
+    begin = targets[0]
+    duration = jax.lax.stop_gradient(targets[-1] - begin)
+    return duration / LOOKS
 
 
 def first_flight(
@@ -526,10 +562,11 @@ def first_flight(
     step = jnp.minimum(between, longest_step(system, targets))
     # `stepper.Step.clock`: a step in time from 0 of this length, to no target
     no = 0 * step
-    clock = jnp.stack([no, step, no, no])[:, None]
+    clock = jnp.stack([no, step, no, no])
+    target = jnp.zeros((events + 1, 1), bool)
     return Flight(
         state=state,
-        aim=stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock),
+        aim=stepper.Step(rows, target, clock[:, None]),
         plan=jnp.zeros((4, 1), step.dtype),
         free=step,
         event=jnp.zeros(events, bool),
@@ -544,14 +581,17 @@ def next_sample(
     targets: Float[Array, " S"], reached: Int[Array, ""]
 ) -> Float[Array, ""]:
     """Time [s] of the sample that follows the first `reached` ones."""
-    return targets[jnp.minimum(reached, targets.shape[0] - 1)]
+    last = targets.shape[0] - 1
+    following = jnp.minimum(reached, last)
+    return targets[following]
 
 
 def toward_sample(
     flight: Flight, targets: Float[Array, " S"], h: Float[Array, ""]
 ) -> Flight:
     """The flight with a next step of length h [s], which lands on a nearer sample."""
-    left = next_sample(targets, flight.sample) - flight.state.t
+    t = next_sample(targets, flight.sample)
+    left = t - flight.state.t
     lands = left <= h
     # the last margin is the time left; `clock` and `plan`: see `stepper.Step`,
     # `StepperState`
@@ -559,10 +599,10 @@ def toward_sample(
     target = no_target.at[-1].set(lands)
     no = 0 * h
     landing = lands.astype(h.dtype)
-    clock = jnp.stack([no, h, no, landing])[:, None]
+    clock = jnp.stack([no, h, no, landing])
     ahead = jnp.where(lands, left, h)
     plan = flight.plan.at[0, 0].set(ahead).at[1].set(0.0)
-    aim = flight.aim._replace(target=target, clock=clock)
+    aim = flight.aim._replace(target=target, clock=clock[:, None])
     aim, plan = jax.lax.stop_gradient((aim, plan))
     return flight._replace(aim=aim, plan=plan)
 
@@ -582,55 +622,51 @@ def one_pass(
     which `toward_sample` then sets anew.
     """
     state = flight.state
+    aim = flight.aim
+    errors = _errors(flow, settings, allowed, flight)
+    tolerances = jax.lax.stop_gradient(errors / flow.rtol)
     flow = dataclasses.replace(
-        flow,
-        sample=next_sample(targets, flight.sample),
-        sizes=jax.lax.stop_gradient(
-            _errors(flow, settings, allowed, flight) / flow.rtol
-        )[:, None],
+        flow, sample=next_sample(targets, flight.sample), sizes=tolerances[:, None]
     )
     # passes are counted here: their number does not lower the tolerance
     no_passes = flight.plan.at[2:].set(0.0)
-    carry = stepper.StepperState(_rows(flow, state), flight.aim, no_passes)
-    after, accept = stepper.advance(flow, carry, 2)
-    accept = accept[0, 0] & flies
-    landed = flight.aim.target[:, 0] & accept  # margins that the step has brought to 0
+    rows = _rows(flow, state)
+    carry = stepper.StepperState(rows, aim, no_passes)
+    after, accepted = stepper.advance(flow, carry, 2)
+    step = after.step
+    accept = accepted[0, 0] & flies
+    landed = aim.target[:, 0] & accept  # margins that the step has brought to 0
     sampled = landed[-1]
-    new, jumps = _reached(flow, flight.aim, after.y)
+    new, jumps = _reached(flow, aim, after.y)
     state = choose(accept, new, state)
     jumps = jumps & accept
     event = landed[:-1].at[: len(jumps)].max(jumps)  # another normal is an event, too
     counted = jnp.asarray(flies).astype(flight.steps.dtype)
     steps = flight.steps + counted
-    shrinks = after.step.length[0, 0] < _smallest_step(targets)
+    proposed = step.length[0, 0]
+    shrinks = proposed < _smallest_step(targets)
     # a landing on what is left within rounding is as short, and ends
-    lands_not = after.step.lands[0, 0] == 0
+    lands_not = step.lands[0, 0] == 0
     vanishes = flies & ~accept & shrinks & lands_not
-    # what an event or a sample shortens says nothing of the steps after it
-    tried = flight.aim.length[0, 0]
-    lands = flight.aim.lands[0, 0] > 0
-    proposed = after.step.length[0, 0]
-    remembered = jnp.maximum(proposed, FORGET * flight.free)
-    longer = jnp.where(tried < flight.free, remembered, proposed)
-    free_step = jax.lax.stop_gradient(longer)
-    free = jnp.where(accept & ~lands, free_step, flight.free)
+    too_many = steps >= settings.max_steps
+    outside = out_of_range(flow.system, state)
+    free = _free_step(flight, accept, proposed)
     moved = flight._replace(
         state=state,
         free=free,
-        aim=jax.lax.stop_gradient(after.step),
+        aim=jax.lax.stop_gradient(step),
         plan=jax.lax.stop_gradient(after.progress),
         event=jnp.where(flies, event, flight.event),
         jumped=flight.jumped | jnp.any(jumps),
         sample=flight.sample + sampled.astype(flight.sample.dtype),
         steps=steps,
-        stuck=flight.stuck
-        | vanishes
-        | (steps >= settings.max_steps)
-        | out_of_range(flow.system, state),
+        stuck=flight.stuck | vanishes | too_many | outside,
     )
     begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
-    aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
-    in_time = (after.step.in_root[0, 0] == 0) & lands_not
+    h = jnp.where(sampled, begins, proposed)
+    aimed = toward_sample(moved, targets, h)
+    in_root = step.in_root[0, 0]
+    in_time = (in_root == 0) & lands_not
     # the stepper keeps its plan for a landing, a step in the root of time, and a
     # rejected one
     plain = sampled | (accept & in_time)
@@ -638,28 +674,56 @@ def one_pass(
     return moved._replace(aim=aim, plan=plan), accept
 
 
-def out_of_range(system: System, at: State) -> Bool[Array, ""]:
-    """True where q is outside the range in which the gap function of the body holds."""
-    if type(system.body).valid is Body.valid:
+def _free_step(
+    flight: Flight, accept: Bool[Array, ""], proposed: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Length [s] of steps that neither event nor sample shortens, after a step.
+
+    The `proposed` one after an accepted step; where that step was shortened at least
+    FORGET of the old one, as it says nothing of the steps after it; the old one after a
+    step that was rejected or is a landing.
+    """
+    old = flight.free
+    tried = flight.aim.length[0, 0]
+    lands = flight.aim.lands[0, 0] > 0
+    remembered = jnp.maximum(proposed, FORGET * old)
+    shortened = tried < old
+    longer = jnp.where(shortened, remembered, proposed)
+    new = jax.lax.stop_gradient(longer)
+    changes = accept & ~lands
+    return jnp.where(changes, new, old)
+
+
+def out_of_range(system: System, state: State) -> Bool[Array, ""]:
+    """True where q is outside the range in which the gap function of the body holds.
+
+    False for a body that states no range.
+    """
+    body = system.body
+    if type(body).valid is Body.valid:
         return jnp.asarray(False)
-    seen = seen_from_base(system, at.q, at.t)
-    return ~(system.body.valid(seen) >= 0)
+    seen = seen_from_base(system, state.q, state.t)
+    margin = body.valid(seen)
+    return ~(margin >= 0)
 
 
 def status_at_start(
-    system: System, at: State, end: Float[Array, ""], closed_below: Any
+    system: System, state: State, end: Float[Array, ""], closed_below: Any
 ) -> Int[Array, ""]:
     """Status code of a motion that begins in this state and shall last until `end`
     [s].
     """
     allowed = jnp.maximum(closed_below, system.body.overlap)
-    gap = recorded_gaps(system, at.q, at.t)
-    penetrates = jnp.any(gap < -allowed)
+    gap = recorded_gaps(system, state.q, state.t)
+    indented = gap < -allowed
+    penetrates = jnp.any(indented)
+    outside = out_of_range(system, state)
+    backward = end <= state.t
     status = jnp.where(penetrates, CODE["penetration"], CODE["ok"])
-    status = jnp.where(out_of_range(system, at), CODE["out_of_range"], status)
-    status = jnp.where(end <= at.t, CODE["backward"], status)
-    finite_q = jnp.all(jnp.isfinite(at.q))
-    finite_v = jnp.all(jnp.isfinite(at.v))
+    status = jnp.where(outside, CODE["out_of_range"], status)
+    status = jnp.where(backward, CODE["backward"], status)
+    finite_q = jnp.all(jnp.isfinite(state.q))
+    finite_v = jnp.all(jnp.isfinite(state.v))
     finite = finite_q & finite_v & jnp.isfinite(end)
     code = jnp.where(finite, status, CODE["not_finite"])
     return code.astype(jnp.int32)
@@ -667,8 +731,9 @@ def status_at_start(
 
 def _rows(flow: MotionFlow, state: State) -> Float[Array, "rows 1"]:
     """Rows of the state, then `error_only_rows`, which begin at 0."""
+    rows = packed(state)
     more = (0, flow.error_only_rows)
-    return jnp.pad(packed(state), (more, (0, 0)))
+    return jnp.pad(rows, (more, (0, 0)))
 
 
 def _reached(
@@ -680,8 +745,10 @@ def _reached(
     On a sample t is that of the sample to the last digit.
     """
     const = flow.constants(aim.modes)
-    new, jumps = flow.projected(const, unpacked(flow.like, y))
-    t = jnp.where(aim.target[-1, 0], flow.sample, new.t)
+    reached = unpacked(flow.like, y)
+    new, jumps = flow.projected(const, reached)
+    on_sample = aim.target[-1, 0]
+    t = jnp.where(on_sample, flow.sample, new.t)
     return new._replace(t=t), jumps
 
 
@@ -704,22 +771,26 @@ def _errors(
     mass = mass_at(system, state.q)
     rates = free_acceleration(system, state.q, state.v, push, mass)
     q_rates = jnp.abs(system.body.rates(state.q, state.v))
+    v_rates = jnp.abs(rates)
     of_q = jnp.abs(state.q) + h * q_rates
-    of_v = jnp.abs(state.v) + h * jnp.abs(rates)
+    of_v = jnp.abs(state.v) + h * v_rates
     sizes = jnp.concatenate([of_q, of_v])
-    errors = [settings.atol + settings.rtol * sizes, allowed]
+    errors = settings.atol + settings.rtol * sizes
     others = flow.errors_of_error_only_rows(settings, state, h, of_q)
-    return jnp.concatenate([*errors, *others])
+    return jnp.concatenate([errors, allowed, *others])
 
 
 def _smallest_step(targets: Float[Array, " S"]) -> Float[Array, ""]:
     """Length [s] below which a step does not move time any more."""
-    latest = jnp.abs(targets[0]) + jnp.abs(targets[-1])
-    return not_rounding(SMALLEST_STEP, targets.dtype) * latest
+    begin = jnp.abs(targets[0])
+    end = jnp.abs(targets[-1])
+    latest = begin + end
+    share = not_rounding(SMALLEST_STEP, targets.dtype)
+    return share * latest
 
 
 def allowed_errors(
-    system: System, settings: Settings, at: State, share: float = LEDGER
+    system: System, settings: Settings, state: State, share: float = LEDGER
 ) -> Float[Array, " rows"]:
     """Errors allowed in all rows of the state but q and v: time, works [J], contacts.
 
@@ -727,32 +798,37 @@ def allowed_errors(
     `e = atol + rtol |.|` of q and v; at least atol; time may err by anything, as it is
     integrated exactly.
     """
-    mass = mass_at(system, at.q)
-    push = user_force(system, at.q, at.v, at.t)
-    free = free_acceleration(system, at.q, at.v, push, mass)
-    both = jnp.stack([free, at.v], axis=1)
-    # |M v'|, |M v|
-    pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
-    of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
+    q, v, t, *_ = state
+    mass = mass_at(system, q)
+    push = user_force(system, q, v, t)
+    free = free_acceleration(system, q, v, push, mass)
+    both = jnp.stack([free, v], axis=1)
+    if mass.ndim == 1:
+        product = mass[:, None] * both
+    else:
+        product = mass @ both
+    by_forces, by_velocity = jnp.abs(product).T  # |M v'|, |M v|
+    e_q = settings.atol + settings.rtol * jnp.abs(q)
+    e_v = settings.atol + settings.rtol * jnp.abs(v)
     if system.body.coordinates is not None:  # of displacements
-        of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
-    by_forces, by_velocity = pushed.T
-    ledger = share * (of_q @ by_forces + of_v @ by_velocity)
-    q_and_v = at.q.shape[0] + at.v.shape[0]
-    rows = packed(at).shape[0] - q_and_v
-    # positive even without motion or forces
-    # time: none
-    least = jnp.maximum(ledger, settings.atol)
-    return jnp.full(rows, least).at[0].set(jnp.inf)
+        e_q = jnp.broadcast_to(jnp.max(e_q), v.shape)
+    work = e_q @ by_forces + e_v @ by_velocity
+    ledger = share * work
+    every_row = len(packed(state))
+    others = every_row - len(q) - len(v)
+    smallest = jnp.maximum(ledger, settings.atol)  # positive even at rest
+    rows = jnp.full(others, smallest)
+    return rows.at[0].set(jnp.inf)  # time
 
 
 def roundings(
     margins: Float[Array, " k"], targets: Float[Array, " S"]
 ) -> Float[Array, " margins"]:
     """Roundings of margins, and last that of the time to the next sample; none is 0."""
-    least = precision(targets.dtype).tiny ** 0.5
-    each = jnp.append(margins, _smallest_step(targets))
-    return jax.lax.stop_gradient(jnp.maximum(each, least))
+    tiny = precision(targets.dtype).tiny
+    smallest = tiny**0.5
+    with_time = jnp.append(margins, _smallest_step(targets))
+    return jax.lax.stop_gradient(jnp.maximum(with_time, smallest))
 
 
 def flow_of(
@@ -769,18 +845,21 @@ def flow_of(
     Roundings of margins: `gap_rounding` of gaps [m], a share of the acceleration of
     normal forces and of the cone, of the speed of slip.
     """
-    share = rest_acceleration(state.q.dtype)
+    dtype = state.q.dtype
+    share = rest_acceleration(dtype)
     slack = share * scales.acceleration
     normal = jnp.where(modes.active, slack, settings.gap_rounding)
-    stuck = modes.stick | (modes.sign == BEGINS)
-    friction = jnp.where(stuck, slack, share * scales.speed)
+    begins = modes.sign == BEGINS
+    stuck = modes.stick | begins
+    of_slip = share * scales.speed
+    friction = jnp.where(stuck, slack, of_slip)
     if settings.friction:
         margins = jnp.concatenate([normal, friction])
     else:
         margins = normal
     rounded = roundings(margins, targets)
     longest = longest_step(system, targets)
-    blank = jnp.zeros((1, 1), state.q.dtype)
+    blank = jnp.zeros((1, 1), dtype)
     # where contacts that were held not quite closed are closed, redundant ones come to
     # lie below
     gap = gaps(system, state.q, state.t)

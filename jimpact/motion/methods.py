@@ -195,8 +195,9 @@ class TimeStepping:
         >>> found.bodies.tolist(), [round(float(p) / 1e-3, 3) for p in found.impulse]
         ([[0, 1], [1, -1]], [10.0, 30.0])
         """
-        substeps_of(self, t, t + self.step, 2)  # raises for a step that cannot be one
-        return contacts_of_step(system, law, q, v, t, self.step, self.closed_below)
+        h = self.step
+        substeps_of(self, t, t + h, 2)  # raises for a step that cannot be one
+        return contacts_of_step(system, law, q, v, t, h, self.closed_below)
 
 
 Method = EventDriven | ContactForces | TimeStepping
@@ -238,7 +239,8 @@ def as_method(
             "belongs to; "
             f"`method` has value {method!r}."
         )
-    made: Method = METHODS[method](**options)
+    make = METHODS[method]
+    made: Method = make(**options)
     return made
 
 
@@ -254,10 +256,14 @@ def substeps_of(
     """Number of equal steps between two samples, so that none is longer than `step`."""
     if is_traced((start, end)):
         raise ValueError("Argument `t_end` must not be traced in time stepping.")
-    between = (float(end) - float(start)) / (samples - 1)
+    duration = float(end) - float(start)
+    intervals = samples - 1
+    between = duration / intervals
     steps = between / float(method.step)
-    count = max(1.0, np.ceil(steps * (1 - 1e-9)))
-    if count * (samples - 1) > MOST_STEPS:
+    # a step that fits but for rounding is not cut in two
+    whole = np.ceil(steps * (1 - 1e-9))
+    count = max(1.0, whole)
+    if count * intervals > MOST_STEPS:
         raise ValueError(
             f"Argument `step` must give at most {MOST_STEPS} steps, but has value "
             f"{method.step:g}."
@@ -313,9 +319,11 @@ def tolerances(
     rtol, atol = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
     if method.rtol is not None:
         rtol = method.rtol
+    if method.atol is not None:
+        atol = method.atol
     if isinstance(method, EventDriven):
         check_rtol(rtol, dtype)
-    return rtol, atol if method.atol is None else method.atol
+    return rtol, atol
 
 
 def _check_flights(method: EventDriven | ContactForces) -> None:

@@ -30,6 +30,8 @@ from jimpact.numerics.dense import (
     regularized,
     solve_definite,
     solve_mass_matrix,
+    unit,
+    unit_outside,
 )
 from jimpact.numerics.friction import solve
 from jimpact.numerics.lcp import solve_lcp
@@ -110,7 +112,8 @@ class Forces(NamedTuple):
 def no_modes(m: int, dtype: jnp.dtype) -> Modes:
     """Modes of m open contacts."""
     none = jnp.zeros(m, bool)
-    return Modes(none, none, jnp.zeros(m, dtype))
+    sign = jnp.zeros(m, dtype)
+    return Modes(none, none, sign)
 
 
 def by_contact(rows: Float[Array, " t"], m: int) -> Float[Array, "m r"]:
@@ -120,26 +123,33 @@ def by_contact(rows: Float[Array, " t"], m: int) -> Float[Array, "m r"]:
 
 def length(rows: Float[Array, "m r"]) -> Float[Array, " m"]:
     """Lengths |u_j| of the vectors u (m, r), with derivative 0 at u_j = 0."""
-    if rows.shape[1] == 1:
+    _, directions = rows.shape
+    if directions == 1:
         return jnp.abs(rows[:, 0])
     square = jnp.sum(rows**2, axis=1)
-    positive = jnp.where(square > 0, square, 1.0)
-    return jnp.where(square > 0, jnp.sqrt(positive), 0.0)
+    moves = square > 0
+    positive = jnp.where(moves, square, 1.0)
+    size = jnp.sqrt(positive)
+    return jnp.where(moves, size, 0.0)
 
 
 def direction(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
     """Unit vectors u_j / |u_j| of u (m, r), 0 where u_j = 0."""
-    if rows.shape[1] == 1:
+    _, directions = rows.shape
+    if directions == 1:
         return jnp.sign(rows)
-    size = length(rows)[:, None]
+    size = length(rows)
+    size = size[:, None]
     return quotient(rows, size, where=size > 0)
 
 
 def in_space(contacts: Contacts) -> bool:
     """True where each contact has two tangents."""
     tangent = contacts.tangent
-    contact_count = len(contacts.normal.rate)
-    return tangent is not None and len(tangent.rate) == 2 * contact_count
+    if tangent is None:
+        return False
+    m = len(contacts.normal.rate)
+    return len(tangent.rate) == 2 * m
 
 
 def held_rows(modes: Modes, size: int) -> Bool[Array, " size"]:
@@ -150,15 +160,17 @@ def held_rows(modes: Modes, size: int) -> Bool[Array, " size"]:
     the first row of a contact is along its slip, the second one across it: where slip
     begins the latter is held.
     """
-    m = modes.active.shape[0]
+    m = len(modes.active)
     stick = modes.active & modes.stick
     if size == m:
         return modes.active
     if size == 2 * m:
         return jnp.concatenate([modes.active, stick])
-    across = stick | (modes.active & (modes.sign == BEGINS))
+    begins = modes.sign == BEGINS
+    across = stick | (modes.active & begins)
     tangential = jnp.stack([stick, across], axis=1)
-    return jnp.concatenate([modes.active, tangential.reshape(-1)])
+    rows = tangential.reshape(-1)
+    return jnp.concatenate([modes.active, rows])
 
 
 def contacts_at(
@@ -199,11 +211,13 @@ def with_normal_forces(contacts: Contacts, push: Float[Array, " m"]) -> Contacts
     forces; tangential ones have `W_tn push` in their accelerations.
     """
     m = len(push)
-    size = jnp.diagonal(contacts.delassus)[:m]
-    without_columns = contacts.delassus.at[:, :m].set(0.0)
-    w = without_columns.at[:m].set(0.0)
-    pushed = contacts.approach + contacts.delassus[:, :m] @ push
-    delassus = w.at[:m, :m].set(jnp.diag(size))
+    w = contacts.delassus
+    size = jnp.diagonal(w)[:m]
+    of_push = w[:, :m] @ push
+    pushed = contacts.approach + of_push
+    no_columns = w.at[:, :m].set(0.0)
+    decoupled = no_columns.at[:m].set(0.0)
+    delassus = decoupled.at[:m, :m].set(jnp.diag(size))
     approach = pushed.at[:m].set(-size * push)
     return contacts._replace(delassus=delassus, approach=approach)
 
@@ -225,10 +239,11 @@ def _turned(tangent: Kinematics, along: Float[Array, "m 2"]) -> Kinematics:
 
     def turned(rows: Float[Array, "*n t"]) -> Float[Array, "*n t"]:
         """Components of (.., 2 m) along the axes of each contact."""
-        each = rows.reshape(*rows.shape[:-1], -1, 2)
-        return jnp.einsum("...mk,mjk->...mj", each, axes).reshape(rows.shape)
+        split = rows.reshape(*rows.shape[:-1], -1, 2)
+        along_axes = jnp.einsum("...mk,mjk->...mj", split, axes)
+        return along_axes.reshape(rows.shape)
 
-    return Kinematics(*(turned(x) for x in tangent))
+    return Kinematics(*map(turned, tangent))
 
 
 def friction_acceleration(
@@ -241,7 +256,8 @@ def friction_acceleration(
     """
     m = len(mu)
     w = jnp.diagonal(contacts.delassus)[m:]
-    return mu * normal * by_contact(w, m).mean(axis=1)
+    w_tt = by_contact(w, m).mean(axis=1)
+    return mu * normal * w_tt
 
 
 def cone_margins(
@@ -250,12 +266,14 @@ def cone_margins(
     """Distances `(mu lambda_n - |lambda_t|) W_tt` from the rim of the friction cone
     [m/s^2].
     """
-    assert force.tangential is not None
+    tangential = force.tangential
+    assert tangential is not None
     m = len(mu)
     w = jnp.diagonal(contacts.delassus)[m:]
-    sizes = by_contact(w, m).mean(axis=1)
-    drag = length(by_contact(force.tangential, m))
-    return (mu * force.normal - drag) * sizes
+    w_tt = by_contact(w, m).mean(axis=1)
+    drag = length(by_contact(tangential, m))
+    left = mu * force.normal - drag
+    return left * w_tt
 
 
 def slip_begins(
@@ -269,7 +287,8 @@ def slip_begins(
 
     `normal` are forces [N], `growth` is the acceleration of the slip [m/s^2].
     """
-    return _BEGINNING * friction_acceleration(contacts, mu, normal) - growth
+    by_friction = friction_acceleration(contacts, mu, normal)
+    return _BEGINNING * by_friction - growth
 
 
 def forces(
@@ -287,12 +306,16 @@ def forces(
 
     `slip`: directions d, unit vectors; None: in the plane, `modes.sign`.
     """
-    m = contacts.normal.value.shape[0]
+    m = len(contacts.normal.value)
+    delassus = contacts.delassus
     if contacts.tangent is None or mu is None:
         approach = contacts.approach[:, None]
-        normal = _without_friction(contacts.delassus, -approach, modes.active)[:, 0]
-        return Forces(normal, None, contacts.free + contacts.moved @ normal)
+        solution = _without_friction(delassus, -approach, modes.active)
+        normal = solution[:, 0]
+        acceleration = contacts.free + contacts.moved @ normal
+        return Forces(normal, None, acceleration)
     w, held, drag = _dragged(contacts, mu, modes, slip)
+    _, directions = drag.shape
     right = -contacts.approach
 
     def shared(_: Int[Array, ""], known: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -301,14 +324,19 @@ def forces(
         """
         last_push = jax.lax.stop_gradient(known[:m])
         press = mu * jnp.maximum(last_push, 0.0)
-        share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
-        weight = jnp.concatenate([jnp.ones(m, w.dtype), share])
-        sizes = _sizes(w, contacts.delassus, m)
-        return _least(w, right[:, None], held, weight, sizes)[:, 0]
+        share = load_shares(press, _LEAST_SHARE)
+        of_tangents = jnp.repeat(share, directions)
+        of_normals = jnp.ones(m, w.dtype)
+        weight = jnp.concatenate([of_normals, of_tangents])
+        sizes = _sizes(w, delassus, m)
+        solution = _least(w, right[:, None], held, weight, sizes)
+        return solution[:, 0]
 
     # first equal shares, then those by the normal forces that these give
-    held_forces = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
-    sliding_forces = -(drag * held_forces[:m, None]).reshape(-1)
+    none = jnp.zeros_like(right)
+    held_forces = jax.lax.fori_loop(0, 2, shared, none)
+    friction = drag * held_forces[:m, None]
+    sliding_forces = -friction.reshape(-1)
     every_force = held_forces.at[m:].add(sliding_forces)
     acceleration = contacts.free + contacts.moved @ every_force
     return Forces(every_force[:m], every_force[m:], acceleration)
@@ -327,17 +355,21 @@ def _dragged(
     `lambda_t = -mu lambda_n d`: its column of the matrix is `W_n - sum_r W_t mu d`.
     `drag` is mu d where it slides, else 0.
     """
-    m = modes.active.shape[0]
-    k = contacts.delassus.shape[0]
-    slides = (modes.active & ~modes.stick)[:, None]
+    delassus = contacts.delassus
+    m = len(modes.active)
+    k = len(delassus)
+    sliding = modes.active & ~modes.stick
+    slides = sliding[:, None]
     if slip is None:
         along = modes.sign[:, None]
     else:
         along = slip
-    drag = jnp.where(slides, along * mu[:, None], 0.0)
-    dragged = contacts.delassus[:, m:] * drag.reshape(-1)[None]
-    pull = dragged.reshape(k, m, -1).sum(axis=2)
-    w = contacts.delassus.at[:, :m].add(-pull)
+    mu_d = along * mu[:, None]
+    drag = jnp.where(slides, mu_d, 0.0)
+    columns = delassus[:, m:] * drag.reshape(-1)[None]
+    by_tangent = columns.reshape(k, m, -1)
+    pull = by_tangent.sum(axis=2)
+    w = delassus.at[:, :m].add(-pull)
     return w, held_rows(modes, k), drag
 
 
@@ -355,18 +387,22 @@ def regularity(
     at them; below the root of rounding it counts as 0.
     """
     w, held, _ = _dragged(contacts, mu, modes, slip)
-    size = jnp.where(held, jnp.diagonal(contacts.delassus), 1.0)
-    scale = 1 / jnp.sqrt(size)
-    finite = jnp.where(scale < jnp.inf, scale, 1.0)
-    scale = jax.lax.stop_gradient(finite)
-    both = (held[:, None] & held[None, :])[None]
+    diagonal = jnp.diagonal(contacts.delassus)
+    size = jnp.where(held, diagonal, 1.0)
+    scale = _finite(1 / jnp.sqrt(size))
     both_matrices = jnp.stack([w, contacts.delassus])
     k = both_matrices * jnp.outer(scale, scale)[None]
-    eye = jnp.eye(len(held), dtype=w.dtype)[None]
     ridge = precision(w.dtype).eps ** _FAINT_RIDGE
-    regular = jnp.where(both, k, eye) + ridge * eye
+    regular = jax.vmap(unit_outside, (0, None))(k, held) + ridge * unit(w)[None]
     with_friction, without = determinants(regular)
     return with_friction / without
+
+
+def _finite(scale: Float[Array, " k"]) -> Float[Array, " k"]:
+    """The scales, 1 where one is not finite, without derivatives."""
+    some = scale < jnp.inf
+    finite = jnp.where(some, scale, 1.0)
+    return jax.lax.stop_gradient(finite)
 
 
 def rest_acceleration(dtype: jnp.dtype) -> float:
@@ -384,11 +420,14 @@ def _sizes(
     """
     with_friction = jnp.diagonal(dragged)
     without = jnp.diagonal(delassus)
-    sizes = jnp.where(with_friction < _JAMS * without, with_friction, without)
+    jams = with_friction < _JAMS * without
+    sizes = jnp.where(jams, with_friction, without)
     # both rows of slip of a contact alike: else its share would depend on how they are
     # turned
     rows = by_contact(sizes[m:], m)
-    by_mean = jnp.repeat(rows.mean(axis=1), rows.shape[1])
+    _, directions = rows.shape
+    means = rows.mean(axis=1)
+    by_mean = jnp.repeat(means, directions)
     return jnp.concatenate([sizes[:m], by_mean])
 
 
@@ -402,10 +441,11 @@ def _without_friction(
     """
     if len(held) > _INDEPENDENT:
         one = jnp.ones_like(right[:, 0])
-        return _least(w, right, held, one, jnp.diagonal(w), _THIN_RIDGE)
-    both = held[:, None] & held[None, :]
-    k = jnp.where(both, w, jnp.eye(len(held), dtype=w.dtype))
-    of_held = jnp.where(held[:, None], right, 0.0)
+        diagonal = jnp.diagonal(w)
+        return _least(w, right, held, one, diagonal, _THIN_RIDGE)
+    k = unit_outside(w, held)
+    rows = held[:, None]
+    of_held = jnp.where(rows, right, 0.0)
     return solve_definite(k, of_held)
 
 
@@ -424,18 +464,18 @@ def _least(
     refinements remove. Derivatives take `size` for constant: it must not change with
     slip.
     """
-    scale = jnp.where(held, 1 / jnp.sqrt(size), 1.0)
-    finite = jnp.where(scale < jnp.inf, scale, 1.0)
-    scale = jax.lax.stop_gradient(finite)
-    both = held[:, None] & held[None, :]
-    scaled = w * scale[:, None] * (scale * weight)[None]
-    eye = jnp.eye(len(held), dtype=w.dtype)
-    k = jnp.where(both, scaled, eye)
+    rows = held[:, None]
+    root = jnp.sqrt(size)
+    scale = _finite(jnp.where(held, 1 / root, 1.0))
+    weighted = scale * weight
+    scaled = w * scale[:, None] * weighted[None]
+    k = unit_outside(scaled, held)
     scaled_right = right * scale[:, None]
-    right = jnp.where(held[:, None], scaled_right, 0.0)
-    ridges = jnp.where(held, ridge, 0.0)[:, None]
+    right = jnp.where(rows, scaled_right, 0.0)
+    ridges = jnp.where(held, ridge, 0.0)
+    ridges = ridges[:, None]
     z = regularized(k, right, ridges, _REFINEMENTS, without_null=True)
-    return (scale * weight)[:, None] * z
+    return weighted[:, None] * z
 
 
 def constraint_impulse(
@@ -449,19 +489,22 @@ def constraint_impulse(
     Rates have k rows, or m of normals alone; impulses have k. `contacts.moved @ p` is
     the change of velocity, or of position where `rates` are gaps (to first order).
     """
-    friction = contacts.tangent is not None and mu is not None
-    size = rates.shape[0]
-    held = held_rows(modes, size if friction else len(modes.active))[:size]
+    size, *columns_of_rates = rates.shape
     w = contacts.delassus[:size, :size]
     columns = rates.reshape(size, -1)
-    if friction:
-        one = jnp.ones_like(columns[:, 0])
-        p = _least(w, -columns, held, one, jnp.diagonal(w))
-    else:
+    if contacts.tangent is None or mu is None:
+        held = modes.active[:size]
         p = _without_friction(w, -columns, held)
-    rest = contacts.delassus.shape[0] - size
-    padding = ((0, rest),) + ((0, 0),) * (rates.ndim - 1)
-    return jnp.pad(p.reshape(rates.shape), padding)
+    else:
+        held = held_rows(modes, size)[:size]
+        one = jnp.ones_like(columns[:, 0])
+        diagonal = jnp.diagonal(w)
+        p = _least(w, -columns, held, one, diagonal)
+    p = p.reshape(rates.shape)
+    others = len(contacts.delassus) - size
+    after = (0, others)
+    padding = [after, *((0, 0) for _ in columns_of_rates)]
+    return jnp.pad(p, padding)
 
 
 def contact_powers(
@@ -471,14 +514,18 @@ def contact_powers(
 
     The base moves the contact forces: `(N lambda_n + H lambda_t) . B y_b'`.
     """
+    tangential = result.tangential
     friction = jnp.zeros_like(result.normal)
     push = contacts.normal.gradient @ result.normal
-    if contacts.tangent is not None and result.tangential is not None:
-        powers = result.tangential * contacts.tangent.rate
-        friction = by_contact(powers, len(result.normal)).sum(axis=1)
-        push = push + contacts.tangent.gradient @ result.tangential
+    if contacts.tangent is not None and tangential is not None:
+        m = len(result.normal)
+        powers = tangential * contacts.tangent.rate
+        friction = by_contact(powers, m).sum(axis=1)
+        push = push + contacts.tangent.gradient @ tangential
     carried = base_velocity(system, t)
-    return friction, jnp.zeros_like(t) if carried is None else push @ carried
+    if carried is None:
+        return friction, jnp.zeros_like(t)
+    return friction, push @ carried
 
 
 def slip_margins(
@@ -508,24 +555,32 @@ def slip_margins(
     slip = by_contact(contacts.tangent.rate, m)[:, 0]
     if not in_space(contacts):
         slip = modes.sign * slip
-    duration = jnp.where(slip < 0, jnp.abs(lasts), lasts)
+    backwards = slip < 0
+    duration = jnp.where(backwards, jnp.abs(lasts), lasts)
     ends = slip * duration
     if not in_space(contacts):
         return ends
-    both = jnp.concatenate([force.normal, force.tangential])
-    acceleration = contacts.approach + contacts.delassus @ both
+    normal = force.normal
+    all_forces = jnp.concatenate([normal, force.tangential])
+    acceleration = contacts.approach + contacts.delassus @ all_forces
     growth = by_contact(acceleration[m:], m)[:, 0]
-    by_friction = friction_acceleration(contacts, mu, force.normal)
+    c = friction_acceleration(contacts, mu, normal)
     some = speed_scale > 0
-    relative = by_friction * slip / jnp.where(some, speed_scale, 1.0)
+    scale = jnp.where(some, speed_scale, 1.0)
+    relative = c * slip / scale
     falls = relative + jnp.maximum(growth, 0.0)
-    push = jnp.where(force.normal > 0, force.normal, 1.0)
-    across = by_contact(force.tangential, m)[:, 1] / push
-    leaning = _LEANING * jnp.where(mu > 0, mu, 1.0)
-    aside = by_friction - jnp.abs(across) * by_friction / leaning
-    faster = slip_begins(contacts, mu, force.normal, growth)
-    begins = jnp.minimum(jnp.minimum(falls, faster), aside)
-    return jnp.where(modes.sign == BEGINS, begins, ends)
+    pressed = normal > 0
+    push = jnp.where(pressed, normal, 1.0)
+    lambda_t2 = by_contact(force.tangential, m)[:, 1]
+    across = lambda_t2 / push
+    rubs = mu > 0
+    leaning = _LEANING * jnp.where(rubs, mu, 1.0)
+    aside = c - jnp.abs(across) * c / leaning
+    faster = slip_begins(contacts, mu, normal, growth)
+    smallest = jnp.minimum(falls, faster)
+    smallest = jnp.minimum(smallest, aside)
+    begins = modes.sign == BEGINS
+    return jnp.where(begins, smallest, ends)
 
 
 class ModeChoice(NamedTuple):
@@ -549,7 +604,7 @@ class ModeChoice(NamedTuple):
 def choose_with_friction(
     contacts: Contacts,
     mu: Float[Array, " m"],
-    before: Modes,
+    old: Modes,
     touching: Bool[Array, " m"],
     released: Bool[Array, " 2*m"],
     sliding: Bool[Array, " m"],
@@ -566,7 +621,7 @@ def choose_with_friction(
     Args:
         contacts: contact space.
         mu: coefficients of friction.
-        before: modes up to now.
+        old: modes up to now.
         touching: gap and gap velocity are 0.
         released: (2 m,) normal, then tangential constraints that have just ended: they
             hold again only with a force, not by rounding.
@@ -575,19 +630,26 @@ def choose_with_friction(
     """
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
-    slid = before.active & ~before.stick
-    slip_began = jnp.any(slid & (before.sign == BEGINS))
+    slid = old.active & ~old.stick
+    had_begun = old.sign == BEGINS
+    slip_began = jnp.any(slid & had_begun)
     problem = _ModeProblem(contacts, mu, touching, released, sliding, slip_began, slack)
-    expected, directions = _expected_modes(problem, before)
+    expected, directions = _expected_modes(problem, old)
     no = jnp.asarray(False)
     one = jnp.ones_like(slack)
     passes = jnp.asarray(0)
     start = _ModeTrial(expected, directions, touching, one, no, no, no, passes)
-    end = jax.lax.while_loop(
-        lambda trial: ~trial.done & (trial.passes < _PASSES),
-        lambda trial: _next_trial(problem, trial),
-        start,
-    )
+
+    def goes_on(trial: _ModeTrial) -> Bool[Array, ""]:
+        """True until a trial is done, at most `_PASSES` times."""
+        some_left = trial.passes < _PASSES
+        return ~trial.done & some_left
+
+    def following(trial: _ModeTrial) -> _ModeTrial:
+        """The next trial of this problem."""
+        return _next_trial(problem, trial)
+
+    end = jax.lax.while_loop(goes_on, following, start)
     parts = touching & ~end.may_press
     several = end.several & end.solved
     return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
@@ -613,8 +675,9 @@ class _ModeProblem(NamedTuple):
         """Modes in which all touching contacts are persistent, and stick unless they
         slide.
         """
-        ones = jnp.ones(len(self.mu), self.mu.dtype)
-        return Modes(self.touching, self.touching & ~self.sliding, ones)
+        one = jnp.ones_like(self.mu)
+        sticks = self.touching & ~self.sliding
+        return Modes(self.touching, sticks, one)
 
 
 class _ModeTrial(NamedTuple):
@@ -632,52 +695,63 @@ class _ModeTrial(NamedTuple):
 
 
 def _expected_modes(
-    problem: _ModeProblem, before: Modes
+    problem: _ModeProblem, old: Modes
 ) -> tuple[Modes, Float[Array, "m r"]]:
-    """Modes to try first: as before, but for constraints that ended; directions of
+    """Modes to try first: the `old` ones, but for constraints that ended; directions of
     known slip.
 
     The direction of a contact that slides is that of its slip u; slip starts against
     the last force of sticking, `-lambda_t / |lambda_t|`; 0 where the direction is to be
-    solved for.
+    solved for. In space a contact at the rim of the cone starts to slide where another
+    one does.
     """
     contacts, mu, touching, released, sliding, _, slack = problem
     assert contacts.tangent is not None
     m = len(mu)
     spatial = in_space(contacts)
-    slid = before.active & ~before.stick
-    # friction has reached the cone: slip starts
-    broken = released[m:] & before.stick & ~sliding
-    ended = jnp.any(released[m:] & slid)  # slip of a contact has come to 0
+    slid = old.active & ~old.stick
+    ends = released[m:]  # of sticking or of slip, just now
+    let_go = ends & old.stick  # friction has reached the cone: slip starts
+    broken = let_go & ~sliding
+    ended = jnp.any(ends & slid)  # slip of a contact has come to 0
     # where sticking breaks at one contact of a body, those that began to slide before
     # go on
-    one_broke = jnp.any(released[m:] & before.stick)
+    one_broke = jnp.any(let_go)
     goes_on = slid & one_broke & ~ended & ~sliding
     # in space directions are not remembered
     if spatial:
         starts = broken | goes_on
     else:
         starts = broken
-    stick = ~sliding & (starts | ~goes_on)
-    sign = jnp.where(goes_on, before.sign, 0.0)
+    may_stick = starts | ~goes_on
+    stick = ~sliding & may_stick
+    sign = jnp.where(goes_on, old.sign, 0.0)
     now = Modes(touching, stick, sign)
-    moves = direction(by_contact(contacts.tangent.rate, m))
-    slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
+    of_slip = direction(by_contact(contacts.tangent.rate, m))
+    has_slip = sliding[:, None]
+    if spatial:
+        slides = jnp.where(has_slip, of_slip, 0.0)
+    else:
+        slides = jnp.where(has_slip, of_slip, sign[:, None])
     # sliding begins against the last force of sticking
-    held_on = now._replace(active=touching & ~released[:m])
+    still_held = touching & ~released[:m]
+    held_on = now._replace(active=still_held)
     # one evaluation of forces for both modes, so that it is compiled once
     two_modes = jax.tree.map(lambda *x: jnp.stack(x), held_on, problem.sticking_modes)
     both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), two_modes)
-    held, stuck = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+    held = jax.tree.map(lambda x: x[0], both)
+    stuck = jax.tree.map(lambda x: x[-1], both)
     assert held.tangential is not None
     against = by_contact(held.tangential, m)
-    if spatial:
-        against = -direction(against)
+    if not spatial:
+        pushes_ahead = against > 0
+        against = jnp.where(pushes_ahead, -1.0, 1.0)
     else:
-        against = jnp.where(against > 0, -1.0, 1.0)
-    if spatial:  # redundant contacts that share equally break loose together
-        rim = cone_margins(contacts, mu, stuck) <= slack
-        at_rim = before.active & before.stick & ~sliding & rim
+        against = -direction(against)
+        # redundant contacts that share equally break loose together
+        left = cone_margins(contacts, mu, stuck)
+        stuck_before = old.active & old.stick
+        at_rim = stuck_before & ~sliding & (left <= slack)
         starts = starts | (at_rim & jnp.any(broken))
     return now, jnp.where(starts[:, None], against, slides)
 
@@ -694,17 +768,16 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
     m = len(mu)
     known = last.known
     dtype = known.dtype
-    diagonal = jnp.diagonal(contacts.delassus)[:m]
+    w = contacts.delassus
+    diagonal = jnp.diagonal(w)[:m]
     # rows of contacts that take part: normals (m), then their tangents; others get
     # lambda = 0
-    tangents = jnp.repeat(last.may_press, known.shape[1])
+    _, directions = known.shape
+    tangents = jnp.repeat(last.may_press, directions)
     rows = jnp.concatenate([last.may_press, tangents])
-    eye = jnp.eye(len(rows), dtype=dtype)
-    both = rows[:, None] & rows[None]
-    w = jnp.where(both, contacts.delassus, eye)
     free = jnp.where(rows, contacts.approach, 0.0)
     solution = solve(
-        w,
+        unit_outside(w, rows),
         free[:m],
         free[m:],
         mu * jnp.ones(m, dtype),
@@ -712,46 +785,58 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
         sliding=known.reshape(-1),
     )
     every_force = jnp.concatenate([solution.normal, solution.tangential])
-    acceleration = contacts.approach + contacts.delassus @ every_force
+    acceleration = contacts.approach + w @ every_force
+    of_gap = acceleration[:m]
     # (m, r) of the slip
     along = by_contact(acceleration[m:], m)
     is_known = length(known) > 0
-    active = last.may_press & (acceleration[:m] <= slack)
+    stays = of_gap <= slack
     # what has just let go needs a force, as an acceleration, that is no rounding
     has_force = solution.normal * diagonal > slack
-    active = active & (~released[:m] | has_force)
-    slips = is_known | (length(along) > slack)
+    holds = ~released[:m] | has_force
+    active = last.may_press & stays & holds
+    slip_starts = length(along) > slack
+    slips = is_known | slip_starts
     slide = jnp.where(is_known[:, None], known, direction(along))
     sign = slide[:, 0]
     if in_space(contacts):
         growth = jnp.sum(along * slide, axis=1)
-        slow = slip_begins(contacts, mu, solution.normal, growth) > 0
+        margin = slip_begins(contacts, mu, solution.normal, growth)
+        slow = margin > 0
         from_rest = slow & ~sliding & ~slip_began
         sign = jnp.where(from_rest, float(BEGINS), 1.0)
     modes = Modes(active, active & ~slips, sign)
     # what was taken to slide from rest must do so
-    backwards = jnp.sum(known * along, axis=1) < -slack
-    returns = active & is_known & ~sliding & backwards
-    several = solution.status == CODE["several_outcomes"]
-    solved = solution.status <= CODE["several_outcomes"]
-    free_again = jnp.where(solved, returns, ~sliding)[:, None]
+    ahead = jnp.sum(known * along, axis=1)
+    backwards = ahead < -slack
+    assumed = active & is_known & ~sliding
+    returns = assumed & backwards
+    status = solution.status
+    several = status == CODE["several_outcomes"]
+    solved = status <= CODE["several_outcomes"]
+    free_again = jnp.where(solved, returns, ~sliding)
     # what would go on sliding though it cannot parts, where that is a solution, too
     pressed = jnp.where(solved, active, last.may_press)
-    pressing = modes._replace(active=pressed, stick=pressed & ~slips)
+    sticking = pressed & ~slips
+    pressing = modes._replace(active=pressed, stick=sticking)
     regular = regularity(contacts, mu, pressing, slide)
     # flights end where the regularity falls to `root`: contacts are wedged from twice
     # that on
-    wedged = active & slips & (regular <= 2 * precision(dtype).root)
-    moves_apart = acceleration[:m] >= -slack
-    open_ones_part = jnp.all(~touching | last.may_press | moves_apart)
+    root = precision(dtype).root
+    singular = regular <= 2 * root
+    wedged = active & slips & singular
+    moves_apart = of_gap >= -slack
+    fits = ~touching | last.may_press | moves_apart
+    consistent = solved & jnp.all(fits)
+    contradicted = wedged | returns
     return _ModeTrial(
         modes=modes,
-        known=jnp.where(free_again, 0.0, known),
+        known=jnp.where(free_again[:, None], 0.0, known),
         may_press=last.may_press & ~(wedged & several),
         regularity=regular,
         several=several | last.several,
-        solved=solved & open_ones_part & ~jnp.any(wedged),
-        done=solved & open_ones_part & ~jnp.any(wedged | returns),
+        solved=consistent & ~jnp.any(wedged),
+        done=consistent & ~jnp.any(contradicted),
         passes=last.passes + 1,
     )
 
@@ -773,14 +858,16 @@ def pressed_together(
     Gap accelerations below `slack` [m/s^2] are rounding.
     """
     contacts = jax.lax.stop_gradient(contacts)
-    m = touching.shape[0]
+    m = len(touching)
     w = contacts.delassus[:m, :m]
-    b = jnp.where(touching, contacts.approach[:m], 0.0)
-    both = touching[:, None] & touching[None, :]
-    eye = jnp.eye(m, dtype=w.dtype)
+    approach = contacts.approach[:m]
+    b = jnp.where(touching, approach, 0.0)
     # redundant contacts: any of the solutions will do
-    matrix = jnp.where(both, w, eye)
+    matrix = unit_outside(w, touching)
     solution = solve_lcp(matrix, b, regular=True)
-    pressed = touching & (solution.z * jnp.diagonal(w) > slack)
-    stays = touching & ~pressed & (solution.w <= slack)
-    return Pressed(pressed, stays, solution.z)
+    force = solution.z
+    has_force = force * jnp.diagonal(w) > slack
+    pressed = touching & has_force
+    at_rest = solution.w <= slack
+    stays = touching & ~pressed & at_rest
+    return Pressed(pressed, stays, force)

@@ -99,9 +99,11 @@ def slip_axes(
     u = by_contact(contacts.tangent.rate, m)
     speed = length(u)
     slides = modes.active & ~modes.stick
-    starts = slides & (speed <= NO_SLIP * speed_scale)
+    at_rest = speed <= NO_SLIP * speed_scale
+    starts = slides & at_rest
     one = jnp.ones_like(mu)
-    first = jnp.stack([one, jnp.zeros_like(mu)], axis=1)
+    zero = jnp.zeros_like(mu)
+    first = jnp.stack([one, zero], axis=1)
     under_way = (slides & ~starts)[:, None]
     moving = jnp.where(under_way, direction(u), first)
     along = jax.lax.cond(
@@ -112,12 +114,13 @@ def slip_axes(
     last = speed <= LAST * speed_scale
     speed = jnp.where(starts, 0.0, speed)
     # a derivative of the direction that is kept would be that of a turn which goes on
-    kept = (last & (speed > 0))[:, None]
-    along = jnp.where(kept, jax.lax.stop_gradient(along), along)
+    constant = last & (speed > 0)
+    kept_on = jax.lax.stop_gradient(along)
+    along = jnp.where(constant[:, None], kept_on, along)
     share = jnp.where(last, 1.0, AHEAD)
-    least = share * jax.lax.stop_gradient(speed)
-    at_least = jnp.where(starts, FIRST * speed_scale, least)
-    return SlipAxes(along, speed, at_least, last)
+    part = share * jax.lax.stop_gradient(speed)
+    smallest = jnp.where(starts, FIRST * speed_scale, part)
+    return SlipAxes(along, speed, smallest, last)
 
 
 def slip_within(
@@ -130,14 +133,21 @@ def slip_within(
     [m/s].
     """
     u = by_contact(rate, len(axes.speed))
+    u_d = u[:, 0]
+    u_n = u[:, 1]
     # behind its end slip counts as in front of it: its direction would be stiff at the
     # least one
-    ahead = jnp.maximum(jnp.abs(u[:, 0]), axes.least)
-    none = (axes.speed == 0) & (u[:, 0] <= axes.least)
-    straight = (modes.sign == BEGINS) | none
+    size = jnp.abs(u_d)
+    ahead = jnp.maximum(size, axes.least)
+    from_rest = axes.speed == 0
+    small = u_d <= axes.least
+    none = from_rest & small
+    begins = modes.sign == BEGINS
+    straight = begins | none
     ahead = jnp.where(straight, 1.0, ahead)
-    across = jnp.where(straight, 0.0, u[:, 1])
-    return direction(jnp.stack([ahead, across], axis=1))
+    across = jnp.where(straight, 0.0, u_n)
+    within = jnp.stack([ahead, across], axis=1)
+    return direction(within)
 
 
 def straightened(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Modes:
@@ -148,10 +158,13 @@ def straightened(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Mode
     end of a slip knows one direction only, and drifts across it by as much as is left:
     the next step would begin in any direction, and derivatives with it.
     """
-    ahead = by_contact(rate, len(axes.speed))[:, 0]
+    u = by_contact(rate, len(axes.speed))
+    size = jnp.abs(u[:, 0])
     slides = modes.active & ~modes.stick
-    ends = slides & axes.last & (jnp.abs(ahead) < axes.speed)
-    return modes._replace(sign=jnp.where(ends, BEGINS, modes.sign))
+    slower = size < axes.speed
+    ends = slides & axes.last & slower
+    sign = jnp.where(ends, BEGINS, modes.sign)
+    return modes._replace(sign=sign)
 
 
 def log_rates(
@@ -165,14 +178,16 @@ def log_rates(
     assert contacts.tangent is not None
     assert force.tangential is not None
     m = len(axes.speed)
-    both = jnp.concatenate([force.normal, force.tangential])
-    acceleration = contacts.approach + contacts.delassus @ both
+    all_forces = jnp.concatenate([force.normal, force.tangential])
+    acceleration = contacts.approach + contacts.delassus @ all_forces
     growth = by_contact(acceleration[m:], m)
     u = by_contact(contacts.tangent.rate, m)
     speed_squared = jnp.sum(u * u, axis=1)
-    square = jnp.maximum(speed_squared, axes.least**2)
-    slides = modes.active & ~modes.stick & ~axes.last
-    slides &= modes.sign != BEGINS
+    smallest = axes.least**2
+    square = jnp.maximum(speed_squared, smallest)
+    slides = modes.active & ~modes.stick
+    has_begun = modes.sign != BEGINS
+    slides = slides & ~axes.last & has_begun
     power = jnp.sum(u * growth, axis=1)
     return quotient(power, square, where=slides)
 
@@ -185,9 +200,11 @@ def turning_errors(
 
     At most `MOST_TURNING`, and that where the slip is the `last` before its end.
     """
-    share = speed_scale / jnp.where(axes.last, 1.0, axes.speed)
+    speed = jnp.where(axes.last, 1.0, axes.speed)
+    share = speed_scale / speed
     errors = TURNING * rtol * jnp.maximum(share, 1.0)
-    return jnp.where(axes.last, MOST_TURNING, jnp.minimum(errors, MOST_TURNING))
+    bounded = jnp.minimum(errors, MOST_TURNING)
+    return jnp.where(axes.last, MOST_TURNING, bounded)
 
 
 def _first_directions(
@@ -206,12 +223,15 @@ def _first_directions(
     """
     m = len(mu)
     # slip along d, not against it
-    plain = modes._replace(sign=jnp.ones_like(modes.sign))
+    one = jnp.ones_like(modes.sign)
+    plain = modes._replace(sign=one)
     sticks = modes.stick | starts
-    stuck = forces(contacts, mu, plain._replace(stick=sticks), moving)
+    sticking = plain._replace(stick=sticks)
+    stuck = forces(contacts, mu, sticking, moving)
     assert stuck.tangential is not None
     against = -by_contact(stuck.tangential, m)
-    some = starts & (length(against) > 0)
+    has_force = length(against) > 0
+    some = starts & has_force
     ahead = jnp.where(some, against[:, 0], 1.0)
     aside = jnp.where(some, against[:, 1], 0.0)
     angle = jnp.arctan2(aside, ahead)
@@ -235,8 +255,10 @@ def _first_directions(
         assert sliding.tangential is not None
         all_forces = jnp.concatenate([sliding.normal, sliding.tangential])
         acceleration = contacts.approach + contacts.delassus @ all_forces
-        rate = by_contact(acceleration[m:], m)
-        cross = d[:, 0] * rate[:, 1] - d[:, 1] * rate[:, 0]
+        u_rate = by_contact(acceleration[m:], m)
+        d_1 = d[:, 0]
+        d_2 = d[:, 1]
+        cross = d_1 * u_rate[:, 1] - d_2 * u_rate[:, 0]
         turn = jnp.where(starts, cross, 0.0)
         return turn, turn
 
@@ -245,14 +267,18 @@ def _first_directions(
     def newton(_: Int[Array, ""], angle: Float[Array, " m"]) -> Float[Array, " m"]:
         """Angles after one Newton step on `d x u' = 0`, of at most `_MOST_TURN`."""
         jacobian, turn = jax.jacfwd(across, has_aux=True)(angle)
-        size = jax.lax.stop_gradient(jnp.max(jnp.abs(jacobian)))
-        size = jnp.where(size > 0, size, 1.0)
+        largest = jnp.max(jnp.abs(jacobian))
+        size = jax.lax.stop_gradient(largest)
+        some = size > 0
+        size = jnp.where(some, size, 1.0)
         # friction makes the diagonal negative: a little more keeps it regular; other
         # angles stay
         ridge = jnp.where(starts, -_RIDGE, 1.0)
         equations = jacobian / size + eye * ridge[:, None]
         right = -turn[:, None] / size
-        change = solve_by_pivots(equations, right)[0][:, 0]
+        solution, _ = solve_by_pivots(equations, right)
+        change = solution[:, 0]
         return angle + jnp.clip(change, -_MOST_TURN, _MOST_TURN)
 
-    return unit(jax.lax.fori_loop(0, _NEWTON, newton, angle))
+    last_angle = jax.lax.fori_loop(0, _NEWTON, newton, angle)
+    return unit(last_angle)

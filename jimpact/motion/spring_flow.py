@@ -118,44 +118,50 @@ class SpringMotionFlow(CompliantFlow):
     # ---- forces
 
     def contact_forces(  # type: ignore[override]
-        self, const: SpringModes, at: State
+        self, const: SpringModes, state: State
     ) -> tuple[Contacts, Forces]:
         """Contact space, and the forces F of the law and lambda of the springs."""
-        contacts = self.contacts(at)
-        push = normal_forces(self.force, const.phase, contacts, at)
-        n = self.directions(const, at, contacts, push)
-        side = self.tangential_forces(const, at, push, n).reshape(-1)
-        both = jnp.concatenate([push, side])
-        return contacts, Forces(push, side, contacts.free + contacts.moved @ both)
+        contacts = self.contacts(state)
+        push = normal_forces(self.force, const.phase, contacts, state)
+        n = self.directions(const, state, contacts, push)
+        by_springs = self.tangential_forces(const, state, push, n)
+        side = by_springs.reshape(-1)
+        all_forces = jnp.concatenate([push, side])
+        acceleration = contacts.free + contacts.moved @ all_forces
+        return contacts, Forces(push, side, acceleration)
 
     def tangential_forces(
         self,
         const: SpringModes,
-        at: State,
+        state: State,
         push: Float[Array, " m"],
         n: Float[Array, "m b"],
     ) -> Float[Array, "m b"]:
-        """`-k_t xi` of contacts that hold, `-mu F n` of those that slide, 0 of open
-        ones.
+        """`-k_t xi` of contacts that hold, at most mu F long; `-mu F n` of those that
+        slide, 0 of open ones.
         """
-        x = at.contact[0]
+        x = state.contact[0]
+        mu = self.coulomb
         deep = x > 0
         secant = quotient(push, x, where=deep)
-        xi = springs(at)
+        xi = springs(state)
         stretched = self.steep * length(xi)
-        beyond = stretched > self.coulomb * x  # by rounding, or BEYOND
-        share = quotient(self.coulomb * x, stretched, where=beyond, otherwise=1.0)
-        held = -(self.steep * secant * share)[:, None] * xi
-        sliding = -(self.coulomb * push)[:, None] * n
-        holds = (const.slide == Slide.HOLDS)[:, None]
-        side = jnp.where(holds, held, sliding)
-        acts = loaded(const.phase)[:, None]
-        return jnp.where(acts, side, 0.0)
+        limit = mu * x
+        beyond = stretched > limit  # by rounding, or BEYOND
+        share = quotient(limit, stretched, where=beyond, otherwise=1.0)
+        k_t = self.steep * secant * share
+        held = -k_t[:, None] * xi
+        largest = mu * push
+        sliding = -largest[:, None] * n
+        holds = const.slide == Slide.HOLDS
+        side = jnp.where(holds[:, None], held, sliding)
+        acts = loaded(const.phase)
+        return jnp.where(acts[:, None], side, 0.0)
 
     def directions(
         self,
         const: SpringModes,
-        at: State,
+        state: State,
         contacts: Contacts,
         push: Float[Array, " m"],
     ) -> Float[Array, "m b"]:
@@ -164,34 +170,45 @@ class SpringMotionFlow(CompliantFlow):
         """
         assert contacts.tangent is not None
         m = len(push)
-        n = direction(springs(at))
-        if n.shape[1] == 1:
+        mu = self.coulomb
+        n = direction(springs(state))
+        if not self.in_space:
             return n
         u = by_contact(contacts.tangent.rate, m)
-        drags = (const.slide == Slide.DRAGS) & loaded(const.phase)
+        acts = loaded(const.phase)
+        drags = (const.slide == Slide.DRAGS) & acts
         first = jnp.where(drags[:, None], direction(u), n)
-        side = self.tangential_forces(const, at, push, first).reshape(-1)
-        both = jnp.concatenate([push, side])
-        acceleration = contacts.approach + contacts.delassus @ both
+        by_springs = self.tangential_forces(const, state, push, first)
+        side = by_springs.reshape(-1)
+        all_forces = jnp.concatenate([push, side])
+        acceleration = contacts.approach + contacts.delassus @ all_forces
         growth = by_contact(acceleration[m:], m)  # u'
         across = jnp.stack([-first[:, 1], first[:, 0]], axis=1)
-        follows = self.steep * length(u)
-        pace = follows + self.coulomb * self._sinking(const, contacts)
+        speed = length(u)
+        follows = self.steep * speed
+        sinking = self._sinking(const, contacts)
+        pace = follows + mu * sinking
         # x falls faster than n follows u: the limit closes before n turns
         pace = jnp.maximum(pace, 0.5 * follows)
         # mu x phi' / pace with phi' = u x u' / |u|^2
         aside = jnp.sum(across * growth, axis=1)
-        turning = self.coulomb * at.contact[0] * aside
-        divisor = length(u) * pace
+        turning = mu * state.contact[0] * aside
+        divisor = speed * pace
         behind = drags & (divisor > 0)
         lag = quotient(turning, divisor, where=behind)
         ahead = jnp.cos(lag)[:, None] * first
         return ahead - jnp.sin(lag)[:, None] * across
 
+    @property
+    def in_space(self) -> bool:
+        """True where each contact has two tangents."""
+        assert not isinstance(self.like.spring, tuple)  # of motions with springs
+        return len(self.like.spring) > 1
+
     def spring_rates(  # type: ignore[override]
         self,
         const: SpringModes,
-        at: State,
+        state: State,
         contacts: Contacts,
         force: Forces,
     ) -> Float[Array, "b m"]:
@@ -200,32 +217,36 @@ class SpringMotionFlow(CompliantFlow):
         """
         assert contacts.tangent is not None
         u = by_contact(contacts.tangent.rate, len(const.slide))
-        n = direction(springs(at))
+        n = direction(springs(state))
         along = jnp.sum(n * u, axis=1, keepdims=True)
         across = u - along * n
-        r = self.limit(at.contact[0])
-        turns = (const.slide == Slide.SLIDES) & (r > 0)
-        turning = across / jnp.where(turns, r, 1.0)[:, None]
+        r = self.limit(state.contact[0])
+        slides = const.slide == Slide.SLIDES
+        turns = slides & (r > 0)
+        divisor = jnp.where(turns, r, 1.0)
+        turning = across / divisor[:, None]
         rate = jnp.where(turns[:, None], turning, 0.0)
-        holds = (const.slide == Slide.HOLDS)[:, None]
-        rate = jnp.where(holds, u, rate)
-        acts = loaded(const.phase)[:, None]
-        return jnp.where(acts, rate, 0.0).T
+        holds = const.slide == Slide.HOLDS
+        rate = jnp.where(holds[:, None], u, rate)
+        acts = loaded(const.phase)
+        acting = jnp.where(acts[:, None], rate, 0.0)
+        return acting.T
 
-    def sizes_of_springs(self, at: State) -> list[Float[Array, " m"]]:
+    def sizes_of_springs(self, state: State) -> list[Float[Array, " m"]]:
         """Sizes of the rows of springs, of which a step may err by `rtol`.
 
         Those of contacts that hold: r of the deepest indentation, without friction that
         indentation; of those that slide, where n errs by forces alone, 1 over the share
         of the indentation now.
         """
-        modes = self.slide_of_start
+        holds = self.slide_of_start == Slide.HOLDS
         depth = self.scales.depth
-        scale = jnp.where(self.coulomb > 0, self.limit(depth), depth)
-        relative = at.contact[0] / self.scales.depth
+        rubs = self.coulomb > 0
+        scale = jnp.where(rubs, self.limit(depth), depth)
+        relative = state.contact[0] / depth
         share = jnp.clip(relative, self.rtol, 1.0)
-        size = jnp.where(modes == Slide.HOLDS, scale, 1 / share)
-        return [size] * len(at.spring)
+        size = jnp.where(holds, scale, 1 / share)
+        return [size] * len(state.spring)
 
     # ---- events
 
@@ -243,39 +264,48 @@ class SpringMotionFlow(CompliantFlow):
         with the scales r_0 of the deepest indentation, u_0 of slip and r_0' of the
         fastest approach; 1 of open contacts, and of sliding ones without friction.
         """
-        at = unpacked(self.like, y)
-        contacts, force = self.contact_forces(const, at)
+        state = unpacked(self.like, y)
+        contacts, force = self.contact_forces(const, state)
         assert contacts.tangent is not None
         m = len(const.slide)
-        x = at.contact[0]
+        x = state.contact[0]
+        scales = self.scales
         normal = self._normal_margins(const.phase, contacts.normal.rate, x)
         u = by_contact(contacts.tangent.rate, m)
-        n = self.directions(const, at, contacts, force.normal)
+        n = self.directions(const, state, contacts, force.normal)
         acts = loaded(const.phase)
-        rubs = acts & (self.coulomb > 0)
+        has_friction = self.coulomb > 0
+        rubs = acts & has_friction
         holds = const.slide == Slide.HOLDS
-        deepest = self.limit(self.scales.depth)
-        scale = jnp.where(self.coulomb > 0, deepest, 1.0)
+        deepest = self.limit(scales.depth)
+        scale = jnp.where(has_friction, deepest, 1.0)
         r = self.limit(x)
-        within = (r - length(springs(at))) / scale
+        stretched = length(springs(state))
+        within = (r - stretched) / scale
         left = within + BEYOND * self.rtol
-        limit_rate = self.limit(self._sinking(const, contacts))
+        sinking = self._sinking(const, contacts)
+        limit_rate = self.limit(sinking)
         slip = jnp.sum(n * u, axis=1) - limit_rate
-        fastest = self.scales.slip + self.limit(self.scales.speed)
+        fastest = scales.slip + self.limit(scales.speed)
         slip = slip / fastest
         friction = jnp.where(holds, left, slip)
-        friction = jnp.where(rubs | (acts & holds), friction, 1.0)
+        may_end = rubs | (acts & holds)
+        friction = jnp.where(may_end, friction, 1.0)
         parts = [normal, friction]
-        if u.shape[1] == 2:
+        if self.in_space:
             lag = length(u) / self.swift
             drags_now = const.slide == Slide.DRAGS
             drags = jnp.where(drags_now, lag / QUARTER - r, r - lag)
-            parts.append(jnp.where(rubs & ~holds, drags / scale, 1.0))
-        return self.from_margins(jnp.concatenate(parts), at)
+            slides = rubs & ~holds
+            dragging = drags / scale
+            parts.append(jnp.where(slides, dragging, 1.0))
+        margins = jnp.concatenate(parts)
+        return self.from_margins(margins, state)
 
     def _sinking(self, const: SpringModes, contacts: Contacts) -> Float[Array, " m"]:
         """Rate x' [m/s] of the indentations."""
-        return unloading(self.force, const.phase, -contacts.normal.rate)
+        gamma = contacts.normal.rate
+        return unloading(self.force, const.phase, -gamma)
 
     def switch(
         self,
@@ -288,52 +318,55 @@ class SpringMotionFlow(CompliantFlow):
         Slip that ends leaves xi = r n; a contact that closes or opens has xi = 0, and
         slides at once if `kappa eta |u| > mu |f'|` where it closes at x = 0.
         """
-        at = unpacked(self.like, y)
+        state = unpacked(self.like, y)
         const = self.constants(modes)
         m = len(const.slide)
         _, _, fired, *dragging = which[:-1, 0].reshape(-1, m)  # the last: a sample
         toggled = jnp.zeros_like(fired)
         if dragging:  # in space
             toggled = dragging[0] & ~fired
-        contacts, force = self.contact_forces(const, at)
-        n = self.directions(const, at, contacts, force.normal)
+        contacts, force = self.contact_forces(const, state)
+        n = self.directions(const, state, contacts, force.normal)
         assert contacts.tangent is not None
         u = by_contact(contacts.tangent.rate, m)
         has_direction = length(n)[:, None] > 0  # else xi = 0 yet
         n = jnp.where(has_direction, n, direction(u))
         holds = const.slide == Slide.HOLDS
-        x = at.contact[0]
+        x = state.contact[0]
         stopped = fired & ~holds
         begins = fired & holds
         at_limit = self.limit(x)[:, None] * n
-        spring = jnp.where(stopped[:, None], at_limit, springs(at))
+        xi_or_n = springs(state)
+        spring = jnp.where(stopped[:, None], at_limit, xi_or_n)
         slide = jnp.where(stopped, Slide.HOLDS, const.slide)
         other = jnp.where(begins, Slide.SLIDES, slide)
-        drags = begins & self._swift(contacts, x)
+        is_swift = self._swift(contacts, x)
+        drags = begins & is_swift
         other = jnp.where(drags, Slide.DRAGS, other)
         opposite = Slide.SLIDES + Slide.DRAGS - const.slide
         slide = jnp.where(toggled, opposite, other)
-        turns = (begins | toggled)[:, None]
-        spring = jnp.where(turns, n, spring)
-        phase, at = self.switched_phases(const.phase, at, which)
+        turns = begins | toggled
+        spring = jnp.where(turns[:, None], n, spring)
+        phase, new = self.switched_phases(const.phase, state, which)
         was = loaded(const.phase)
         remains = loaded(phase) & was
         slide = jnp.where(remains, slide, Slide.HOLDS)
         spring = jnp.where(remains[:, None], spring, 0.0)
         closes = loaded(phase) & ~was
         slide, spring = self.closed(closes, contacts, x, slide, spring)
-        drags_now = (slide == Slide.DRAGS)[:, None]
-        spring = jnp.where(drags_now, 0.0, spring)
-        at = at._replace(spring=spring.T)
+        drags_now = slide == Slide.DRAGS
+        spring = jnp.where(drags_now[:, None], 0.0, spring)
+        new = new._replace(spring=spring.T)
         rows = jnp.concatenate([phase, slide])
-        return rows[:, None].astype(modes.dtype), packed(at)
+        whole = rows.astype(modes.dtype)
+        return whole[:, None], packed(new)
 
     def _swift(self, contacts: Contacts, x: Float[Array, " m"]) -> Bool[Array, " m"]:
         """True where a contact in space that begins to slide drags."""
         assert contacts.tangent is not None
-        u = by_contact(contacts.tangent.rate, len(x))
-        if u.shape[1] == 1:
+        if not self.in_space:
             return jnp.zeros(len(x), bool)
+        u = by_contact(contacts.tangent.rate, len(x))
         # between the ends of both modes, so that neither ends at once
         return length(u) > 2 * QUARTER * self.swift * self.limit(x)
 
@@ -354,29 +387,33 @@ class SpringMotionFlow(CompliantFlow):
         closing = jax.lax.stop_gradient(contacts.normal.rate)
         widens = self.limit(jnp.abs(closing))
         at_once = closes & (speed > widens)
-        swift = at_once & self._swift(contacts, jnp.zeros_like(x))
+        no_depth = jnp.zeros_like(x)
+        swift = at_once & self._swift(contacts, no_depth)
         slide = jnp.where(at_once, Slide.SLIDES, slide)
         slide = jnp.where(swift, Slide.DRAGS, slide)
-        new_spring = jnp.where(at_once[:, None], direction(u), spring)
+        slides = at_once[:, None]
+        new_spring = jnp.where(slides, direction(u), spring)
         return slide, new_spring
 
     def projected(  # type: ignore[override]
-        self, const: SpringModes, at: State
+        self, const: SpringModes, state: State
     ) -> tuple[State, Bool[Array, " none"]]:
         """The state as it is: springs need no projection."""
-        return at, jnp.zeros(0, bool)
+        return state, jnp.zeros(0, bool)
 
 
-def springs(at: State) -> Float[Array, "m b"]:
+def springs(state: State) -> Float[Array, "m b"]:
     """`State.spring` by contact: xi [m] or n."""
-    assert not isinstance(at.spring, tuple)  # of motions with springs
-    return at.spring.T
+    spring = state.spring
+    assert not isinstance(spring, tuple)  # of motions with springs
+    return spring.T
 
 
 def steepness(force: Force, kappa: Float[Array, " m"]) -> Float[Array, " m"]:
     """`kappa eta`: the tangential stiffness over the secant one F / x."""
     assert force.bistiffness is not None  # see `Compliant`
-    return kappa * jnp.asarray(force.bistiffness.exponent, kappa.dtype)
+    exponent = force.bistiffness.exponent
+    return kappa * jnp.asarray(exponent, kappa.dtype)
 
 
 def spring_modes(modes: Int[Array, "k 1"], like: State) -> SpringModes:
@@ -384,7 +421,8 @@ def spring_modes(modes: Int[Array, "k 1"], like: State) -> SpringModes:
     phase, slide = modes[:, 0].reshape(2, -1)
     acts = loaded(phase)
     one = jnp.ones_like(like.contact[0])
-    friction = Modes(acts, slide == Slide.HOLDS, one)
+    holds = slide == Slide.HOLDS
+    friction = Modes(acts, holds, one)
     return SpringModes(phase, friction, slide)
 
 
@@ -397,7 +435,7 @@ def margins_of_springs(problem: MotionProblem) -> int:
 
 def springs_at_start(
     problem: MotionProblem,
-    at: State,
+    state: State,
     phase: Int[Array, " m"],
     fastest: Float[Array, " s"],
 ) -> tuple[Int[Array, " rows"], State]:
@@ -408,20 +446,22 @@ def springs_at_start(
     """
     holds = jnp.full_like(phase, Slide.HOLDS)
     rows = jnp.concatenate([phase, holds])
-    flow = spring_flow(problem, at, rows[:, None], fastest)
-    contacts = flow.contacts(at)
-    x = at.contact[0]
+    flow = spring_flow(problem, state, rows[:, None], fastest)
+    contacts = flow.contacts(state)
+    x = state.contact[0]
     closes = loaded(phase) & (x <= 0)
-    slide, spring = flow.closed(closes, contacts, x, holds, springs(at))
-    drags = (slide == Slide.DRAGS)[:, None]
-    spring = jnp.where(drags, 0.0, spring)
-    both = jnp.concatenate([phase, slide])
-    return both, at._replace(spring=spring.T)
+    xi = springs(state)
+    slide, spring = flow.closed(closes, contacts, x, holds, xi)
+    drags = slide == Slide.DRAGS
+    spring = jnp.where(drags[:, None], 0.0, spring)
+    rows = jnp.concatenate([phase, slide])
+    start = state._replace(spring=spring.T)
+    return rows, start
 
 
 def spring_flow(
     problem: MotionProblem,
-    at: State,
+    state: State,
     modes: Int[Array, "k 1"],
     fastest: Float[Array, " s"],
 ) -> SpringMotionFlow:
@@ -435,59 +475,72 @@ def spring_flow(
     force = problem.law
     settings = problem.settings
     kappa = problem.tangential_stiffness
+    times = problem.times
     m = problem.contacts
     assert kappa is not None
-    contacts = contacts_at(system, at.q, at.v, at.t, friction=True)
-    scales = contact_scales(force, contacts, _with_stored(force, contacts, at, fastest))
-    snap = jnp.full(m, SNAP * settings.rtol, at.q.dtype)
-    noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
-    by_speed = jnp.maximum(snap, noise / scales.speed)
-    slide = spring_modes(modes, at).slide
+    dtype = state.q.dtype
+    contacts = contacts_at(system, state.q, state.v, state.t, friction=True)
+    with_stored = _with_stored(force, contacts, state, fastest)
+    scales = contact_scales(force, contacts, with_stored)
+    rtol = settings.rtol
+    snap = jnp.full(m, SNAP * rtol, dtype)
+    largest = jnp.max(jnp.abs(contacts.approach))
+    noise = velocity_noise(settings, largest)
+    of_rate = noise / scales.speed
+    by_speed = jnp.maximum(snap, of_rate)
+    slide = spring_modes(modes, state).slide
     # where slip ends as much is left as counts as none: a margin that then falls by
     # rounding, and rises, has no event
-    at_limit = jnp.full(m, 2 * BEYOND * settings.rtol, at.q.dtype)
-    of_slip = jnp.maximum(snap, noise / scales.slip)
-    by_slip = jnp.where(slide == Slide.HOLDS, at_limit, of_slip)
+    twice = 2 * BEYOND * rtol
+    at_limit = jnp.full(m, twice, dtype)
+    noise_of_slip = noise / scales.slip
+    of_slip = jnp.maximum(snap, noise_of_slip)
+    holds = slide == Slide.HOLDS
+    by_slip = jnp.where(holds, at_limit, of_slip)
     rows = [snap, by_speed, by_slip]
     if settings.spatial:
         rows.append(snap)
-    state_rows = len(packed(at))
-    blank = jnp.zeros((state_rows, 1), at.q.dtype)
-    longest = longest_step(system, problem.times)
+    state_rows = len(packed(state))
+    blank = jnp.zeros((state_rows, 1), dtype)
+    longest = longest_step(system, times)
+    omega = _frequency(force, kappa, contacts, scales.depth)
     flow = SpringMotionFlow(
         system=system,
-        rounding=roundings(jnp.concatenate(rows), problem.times),
-        sample=problem.times[0],
-        rtol=settings.rtol,
+        rounding=roundings(jnp.concatenate(rows), times),
+        sample=times[0],
+        rtol=rtol,
         sizes=blank,
-        like=at,
+        like=state,
         longest=longest,
         mu=problem.mu,
         axes=None,
         force=force,
         scales=scales,
         tangential_stiffness=kappa,
-        swift=SWIFT * _frequency(force, kappa, contacts, scales.depth),
+        swift=SWIFT * omega,
         slide_of_start=slide,
     )
-    longest = jnp.minimum(longest, stable(flow, modes, contacts, at))
+    h = stable(flow, modes, contacts, state)
+    longest = jnp.minimum(longest, h)
     return dataclasses.replace(flow, longest=longest)
 
 
 def _with_stored(
-    force: Force, contacts: Contacts, at: State, fastest: Float[Array, " s"]
+    force: Force, contacts: Contacts, state: State, fastest: Float[Array, " s"]
 ) -> Float[Array, " s"]:
     """Largest approach, then slip, of each contact [m/s], the approach at least what
     its indentation could give.
 
     Equation: `sqrt(W_jj F x)`, of contacts that carry a load without having struck.
     """
-    m = contacts.normal.value.shape[0]
-    x = jnp.maximum(at.contact[0], 0.0)
+    m = len(contacts.normal.value)
+    x = jnp.maximum(state.contact[0], 0.0)
     w = jnp.diagonal(contacts.delassus)[:m]
-    push = force.force(x, jnp.zeros_like(x))
-    stored = jnp.sqrt(w * push * x)
-    return fastest.at[:m].max(jax.lax.stop_gradient(stored))
+    no_rate = jnp.zeros_like(x)
+    push = force.force(x, no_rate)
+    energy = w * push * x
+    stored = jax.lax.stop_gradient(jnp.sqrt(energy))
+    return fastest.at[:m].max(stored)
 
 
 def _frequency(
@@ -502,8 +555,10 @@ def _frequency(
     Equation: `omega^2 = max_i sum_j |W_ij| k_j`, k_j = dF/dx in normal rows and
     kappa dF/dx in tangential ones.
     """
-    normal = stiffness_of(force, x, jnp.zeros_like(x))
-    return _fastest(contacts, normal, kappa * normal)
+    no_rate = jnp.zeros_like(x)
+    normal = stiffness_of(force, x, no_rate)
+    tangential = kappa * normal
+    return _fastest(contacts, normal, tangential)
 
 
 def _fastest(
@@ -511,14 +566,16 @@ def _fastest(
 ) -> Float[Array, ""]:
     """`sqrt(max_i sum_j |W_ij| k_j)` [1/s] of the stiffnesses k [N/m] of all rows."""
     m = len(normal)
-    count = (len(contacts.delassus) - m) // m
-    rows = jnp.concatenate([normal, jnp.repeat(tangential, count)])
-    square = jnp.max(jnp.abs(contacts.delassus) @ rows)
+    w = jnp.abs(contacts.delassus)
+    tangents = (len(w) - m) // m
+    of_tangents = jnp.repeat(tangential, tangents)
+    k = jnp.concatenate([normal, of_tangents])
+    square = jnp.max(w @ k)
     return jax.lax.stop_gradient(jnp.sqrt(square))
 
 
 def stable(
-    flow: SpringMotionFlow, modes: Int[Array, "k 1"], contacts: Contacts, at: State
+    flow: SpringMotionFlow, modes: Int[Array, "k 1"], contacts: Contacts, state: State
 ) -> Float[Array, ""]:
     """Longest stable step [s]: `min(STABLE / omega, TURN r / |u|)`.
 
@@ -528,21 +585,28 @@ def stable(
     assert contacts.tangent is not None
     const = flow.constants(modes)
     m = len(const.slide)
-    x = jnp.maximum(at.contact[0], 0.0)
-    stiffness = stiffness_of(flow.force, x, jnp.zeros_like(x))
+    x = jnp.maximum(state.contact[0], 0.0)
+    no_rate = jnp.zeros_like(x)
+    stiffness = stiffness_of(flow.force, x, no_rate)
     acts = loaded(const.phase)
-    holds = acts & (const.slide == Slide.HOLDS)
+    held = const.slide == Slide.HOLDS
+    holds = acts & held
     steep = unloading(flow.force, const.phase, stiffness)
     normal = jnp.where(acts, steep, 0.0)
-    side = jnp.where(holds, flow.tangential_stiffness * stiffness, 0.0)
+    k_t = flow.tangential_stiffness * stiffness
+    side = jnp.where(holds, k_t, 0.0)
     fastest = _fastest(contacts, normal, side)
     some = fastest > 0
     by_springs = quotient(STABLE, fastest, where=some, otherwise=jnp.inf)
     slip = length(by_contact(contacts.tangent.rate, m))
-    turns = acts & (const.slide == Slide.SLIDES) & (slip > 0)
-    if len(at.spring) == 1:
+    slides = const.slide == Slide.SLIDES
+    moves = slip > 0
+    turns = acts & slides & moves
+    if not flow.in_space:
         turns = jnp.zeros_like(turns)
     r = flow.limit(x)
-    by_turning = quotient(TURN * r, slip, where=turns, otherwise=jnp.inf)
-    longest = jnp.minimum(by_springs, jnp.min(by_turning))
+    turn = TURN * r
+    by_turning = quotient(turn, slip, where=turns, otherwise=jnp.inf)
+    shortest = jnp.min(by_turning)
+    longest = jnp.minimum(by_springs, shortest)
     return jax.lax.stop_gradient(longest)

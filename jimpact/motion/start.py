@@ -77,34 +77,35 @@ def start_of(
     start, end = (time.astype(q.dtype) for time in times)
     _check_coordinates(system, q, v, start, end)
     here = _at_start(system, q, v, start, end)
+    gap = here.gaps
     # `q`, an array of the system, or one that its functions close over
     if is_traced(here):
         system = _with_closures_as_leaves(system, q, v, start)
     else:
         _check_values_at_start(system, here, start, end)
-    below, rounding = _closed_gaps(q, here.gaps, closed_below)
+    below, rounding = _closed_gaps(q, gap, closed_below)
     if not may_penetrate:
         allowed = jnp.maximum(below, system.body.overlap)
-        check_penetration("q0", here.gaps, allowed)
-    friction = _friction_of(system, law, here)
-    two_tangents = here.tangents == 2 * here.contacts
-    in_space = friction is not None and two_tangents and not is_pile(system)
-    return Start(
-        system, q, v, start, end, friction, below, rounding, here.contacts, in_space
-    )
+        check_penetration("q0", gap, allowed)
+    mu = _friction_of(system, law, here)
+    m = here.contacts
+    two_tangents = here.tangents == 2 * m
+    rubs = mu is not None
+    in_space = rubs and two_tangents and not is_pile(system)
+    return Start(system, q, v, start, end, mu, below, rounding, m, in_space)
 
 
 def as_times(t_end: Any) -> tuple[Any, Any]:
     """Start and end of a motion, which begins at 0 where only its end is said."""
-    if not isinstance(t_end, tuple | list) and np.ndim(t_end) == 0:
-        return 0.0, t_end
-    if len(t_end) != 2:
+    if isinstance(t_end, tuple | list) or np.ndim(t_end) > 0:
+        if len(t_end) == 2:
+            start, end = t_end
+            return start, end
         raise ValueError(
             f"Argument `t_end` must be a time or a pair (t_start, t_end), but has "
             f"value {t_end!r}."
         )
-    start, end = t_end
-    return start, end
+    return 0.0, t_end
 
 
 def _check_coordinates(
@@ -142,11 +143,12 @@ def _check_coordinates(
         )
     for time in (start, end):
         check_shape("t_end", time, (), "a time, or a pair (t_start, t_end)")
-    # the argument `t_end` may hold the start, too
-    named = (("q0", q), ("v0", v), ("t_end", start), ("t_end", end))
-    for name, value in named:
-        check_values(name, value)
-    if not is_traced((start, end)) and not float(end) > float(start):
+    check_values("q0", q)
+    check_values("v0", v)
+    check_values("t_end", start)  # which the argument may hold, too
+    check_values("t_end", end)
+    known = not is_traced((start, end))
+    if known and not float(end) > float(start):
         raise ValueError(
             f"Argument `t_end` must be after the start at {float(start):g} s, "
             f"but has value {float(end):g}."
@@ -185,22 +187,28 @@ def _at_start(
     body = system.body
     base = None
     if system.base is not None:
-        displacement = system.base
+        y_b = system.base
         instants = jnp.linspace(start, end, BASE_INSTANTS)
-        base = jax.vmap(lambda t: jnp.atleast_1d(displacement(t)))(instants)
+        base = jax.vmap(lambda t: jnp.atleast_1d(y_b(t)))(instants)
     with_time = (q, v, start)
     loads = (system.potential, (q,)), (system.force, with_time)
     of_body = ((function, (q,)) for function in body.functions)
     others = [*loads, *of_body]
-    tangents = jax.eval_shape(body.tangents, q)
+    seen = seen_from_base(system, q, start)
+    h = jax.eval_shape(body.tangents, q)
+    if h is None:
+        tangents = None
+    else:
+        _, tangents = h.shape
+    f = jax.eval_shape(body.gap_function, q)
     return _AtStart(
         mass=mass_at(system, q),
         gaps=recorded_gaps(system, q, start),
-        valid=body.valid(seen_from_base(system, q, start)),
+        valid=body.valid(seen),
         base=base,
         others=[function(*args) for function, args in others if callable(function)],
-        contacts=jax.eval_shape(body.gap_function, q).shape[0],
-        tangents=None if tangents is None else tangents.shape[1],
+        contacts=len(f),
+        tangents=tangents,
     )
 
 
@@ -213,13 +221,14 @@ def _check_values_at_start(
     check_range("q0", system.body, here.valid)
     if here.base is None:
         return
-    finite = np.isfinite(np.asarray(here.base))
+    base = np.asarray(here.base)
+    finite = np.isfinite(base)
     bad = ~finite.all(axis=1)
     if bad.any():
         instants = np.linspace(float(start), float(end), BASE_INSTANTS)
         raise ValueError(
             "Argument `system` must have a finite base motion, but base(t) has value "
-            f"{np.asarray(here.base)[bad][0]} at t = {instants[bad][0]:g} s."
+            f"{base[bad][0]} at t = {instants[bad][0]:g} s."
         )
 
 
@@ -236,17 +245,19 @@ def _with_closures_as_leaves(
         """
         if isinstance(function, eqx.Module) or not callable(function):
             return function
-        args = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
-        if not is_traced(function(*args)):
+        blank = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
+        value = function(*blank)
+        if not is_traced(value):
             return function
-        new = eqx.filter_closure_convert(function, *args)
+        new = eqx.filter_closure_convert(function, *blank)
         if is_traced(new):
             return new
         return function
 
     def parts(s: System) -> list[Any]:
         """Functions of a system: force, potential, base, and those of its body."""
-        return [s.force, s.potential, s.base, *s.body.functions]
+        of_loads = (s.force, s.potential, s.base)
+        return [*of_loads, *s.body.functions]
 
     of_body = [(q,)] * len(system.body.functions)
     args = [(q, v, t), (q,), (t,), *of_body]
@@ -265,14 +276,17 @@ def _closed_gaps(
     """
     q, f = jax.lax.stop_gradient((q, f))
     numpy: Any = jnp if is_traced((q, f)) else np  # on the host nothing is compiled
-    largest = numpy.maximum(numpy.abs(q).max(), numpy.abs(f).max())
-    off = precision(q.dtype).noise * largest
+    largest_q = numpy.abs(q).max()
+    largest_f = numpy.abs(f).max()
+    largest = numpy.maximum(largest_q, largest_f)
+    dtype = q.dtype
+    off = precision(dtype).noise * largest
     if closed_below is None:
         below = numpy.maximum(CLOSED_BELOW, MORE_CLOSED * off)
     else:
         below = closed_below
     rounding = numpy.maximum(ROUNDING_GAP * below, off)
-    return jnp.asarray(below, q.dtype), jnp.asarray(rounding, q.dtype)
+    return jnp.asarray(below, dtype), jnp.asarray(rounding, dtype)
 
 
 def _friction_of(
@@ -294,7 +308,8 @@ def _friction_of(
     mu = jnp.asarray(mu)
     dtype = here.gaps.dtype
     m = here.contacts
-    if not is_traced(mu) and not np.asarray(mu).any():
+    known = not is_traced(mu)
+    if known and not np.asarray(mu).any():
         return None  # frictionless systems pay nothing
     if here.tangents is None:
         raise ValueError(
@@ -302,7 +317,8 @@ def _friction_of(
             f"{'contacts' if own else 'law'}, but its `tangent_function` gives none."
         )
     if is_traced(mu):
-        mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
+        allowed = mu >= 0
+        mu = jnp.where(allowed, mu, jnp.nan)  # the motion is `not_finite` then
     if here.tangents not in (m, 2 * m):
         raise ValueError(
             "Argument `system` must have one tangent a contact in the plane, two in "
@@ -312,8 +328,10 @@ def _friction_of(
     if is_pile(system):
         check_shape("friction", mu, (), "one for all contacts of a pile")
         return mu.astype(dtype)
-    if mu.shape not in ((), (m,)):
+    shape = (m,)
+    if mu.shape not in ((), shape):
         raise ValueError(
             f"Argument `friction` must have shape () or ({m},), but has {mu.shape}."
         )
-    return jnp.broadcast_to(mu, (m,)).astype(dtype)
+    of_contacts = jnp.broadcast_to(mu, shape)
+    return of_contacts.astype(dtype)

@@ -37,8 +37,9 @@ class AllContacts(NamedTuple):
 
     def fastest(self, v: Float[Array, " n"]) -> Float[Array, ""]:
         """Bound [m/s] of the gap velocities that speeds as in v could give."""
-        normals = jnp.abs(self.directions[:, :, 0])
-        return jnp.max(jnp.abs(v) @ normals)
+        normals = self.directions[:, :, 0]
+        speeds = jnp.abs(v) @ jnp.abs(normals)
+        return jnp.max(speeds)
 
     def velocity_change(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Change of velocity `M^-1 D x` by impulses x [N s]."""
@@ -55,13 +56,16 @@ class AllContacts(NamedTuple):
     @property
     def diagonal(self) -> Float[Array, "m b"]:
         """Diagonal of the Delassus matrix."""
-        m, b = self.matrix.shape[:2]
-        square = self.matrix.reshape(m * b, m * b)
-        return jnp.diagonal(square).reshape(m, b)
+        m, b, *_ = self.matrix.shape
+        k = m * b
+        square = self.matrix.reshape(k, k)
+        diagonal = jnp.diagonal(square)
+        return diagonal.reshape(m, b)
 
     def warm_start(self, last: Any) -> Float[Array, "m b"]:
         """Impulses of the last step, 0 of contacts that are open now."""
-        return jnp.where(self.closed[:, None], last, 0.0)
+        closed = self.closed[:, None]
+        return jnp.where(closed, last, 0.0)
 
     def kept(self, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
         """Impulses x in the form in which `warm_start` of the next step reads them."""
@@ -95,93 +99,109 @@ class ActiveContacts(NamedTuple):
 
     def rates(self, v: Float[Array, " n"]) -> Float[Array, "m b"]:
         """Gap velocities and slips `D^T v` [m/s]."""
-        by_body = v.reshape(-1, self.inverse.shape[1])
+        _, velocities = self.inverse.shape
+        by_body = v.reshape(-1, velocities)
         of_bodies = jnp.pad(by_body, ((0, 1), (0, 0)))
+        pairs = self.pairs
 
         def one(row: Int[Array, ""], rates: Float[Array, "m b"]) -> Float[Array, "m b"]:
             """Rates with those of one block of contacts, `D . v` of their two
             bodies.
             """
-            bodies = block(self.pairs.bodies, row)
-            directions = block(self.pairs.directions, row)
+            bodies = block(pairs.bodies, row)
+            directions = block(pairs.directions, row)
             rates_of_bodies = of_bodies[bodies][:, None]
-            values = jnp.sum(directions * rates_of_bodies, axis=(2, 3))
+            parts = directions * rates_of_bodies
+            values = jnp.sum(parts, axis=(2, 3))
             return with_block(rates, values, row)
 
-        shape = self.pairs.directions.shape[:2]
-        start = jnp.zeros(shape, v.dtype)
-        return over_blocks(self.pairs.filled, one, start)
+        m, b, *_ = pairs.directions.shape
+        start = jnp.zeros((m, b), v.dtype)
+        return over_blocks(pairs.filled, one, start)
 
     def fastest(self, v: Float[Array, " n"]) -> Float[Array, ""]:
         """Bound [m/s] of the gap velocities that speeds as in v could give."""
-        return 2 * jnp.max(jnp.abs(v))
+        fastest = jnp.max(jnp.abs(v))
+        return 2 * fastest
 
     def velocity_change(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Change of velocity `M^-1 D x` by impulses x [N s]."""
-        inverse = self.inverse[:-1].reshape(-1)
-        return self.generalized_impulse(x) * inverse
+        inverse = self.inverse[:-1]
+        impulse = self.generalized_impulse(x)
+        return impulse * inverse.reshape(-1)
 
     def generalized_impulse(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
         """Generalized impulse `D x` of impulses x [N s]."""
+        pairs = self.pairs
 
         def one(
             row: Int[Array, ""], impulses: Float[Array, "k u"]
         ) -> Float[Array, "k u"]:
             """Impulses `sum D x` on the bodies, with those of one block of contacts."""
-            bodies = block(self.pairs.bodies, row)
-            directions = block(self.pairs.directions, row)
+            bodies = block(pairs.bodies, row)
+            directions = block(pairs.directions, row)
             of_directions = block(x, row)[:, :, None, None]
-            each = jnp.sum(directions * of_directions, axis=1)
-            return impulses.at[bodies].add(each)
+            parts = directions * of_directions
+            of_bodies = jnp.sum(parts, axis=1)
+            return impulses.at[bodies].add(of_bodies)
 
         start = jnp.zeros_like(self.inverse)
-        with_wall = over_blocks(self.pairs.filled, one, start)
-        return with_wall[:-1].reshape(-1)
+        with_wall = over_blocks(pairs.filled, one, start)
+        of_bodies = with_wall[:-1]
+        return of_bodies.reshape(-1)
 
     def product(self, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
         """Rates `D^T M^-1 D x` [m/s] that impulses x [N s] give."""
-        return self.rates(self.velocity_change(x))
+        dv = self.velocity_change(x)
+        return self.rates(dv)
 
     @property
     def diagonal(self) -> Float[Array, "m b"]:
         """Diagonal of the Delassus matrix (m, b): `sum D^2 / M` over both bodies."""
+        pairs = self.pairs
 
         def one(
             row: Int[Array, ""], diagonal: Float[Array, "m b"]
         ) -> Float[Array, "m b"]:
             """Diagonal with the part of one block of contacts."""
-            bodies = block(self.pairs.bodies, row)
-            directions = block(self.pairs.directions, row)
-            squares = directions**2 * self.inverse[bodies][:, None]
+            bodies = block(pairs.bodies, row)
+            directions = block(pairs.directions, row)
+            inverse = self.inverse[bodies][:, None]
+            squares = directions**2 * inverse
             of_block = jnp.sum(squares, axis=(2, 3))
             return with_block(diagonal, of_block, row)
 
-        shape = self.pairs.directions.shape[:2]
-        start = jnp.zeros(shape, self.inverse.dtype)
-        return over_blocks(self.pairs.filled, one, start)
+        m, b, *_ = pairs.directions.shape
+        start = jnp.zeros((m, b), self.inverse.dtype)
+        return over_blocks(pairs.filled, one, start)
 
     def warm_start(self, last: Any) -> Float[Array, "m b"]:
         """Impulses of the last step at the same contacts, found by number; 0 of new
         ones.
         """
-        row = jnp.searchsorted(last.number, self.pairs.number)
-        row = jnp.minimum(row, last.number.size - 1)
-        same = self.closed & (last.number[row] == self.pairs.number)
+        number = self.pairs.number
+        row = jnp.searchsorted(last.number, number)
+        end = last.number.size - 1
+        row = jnp.minimum(row, end)
+        found = last.number[row] == number
+        same = self.closed & found
         impulse = last.impulse[row]
         return jnp.where(same[:, None], impulse, 0.0)
 
     def kept(self, x: Float[Array, "m b"]) -> PileImpulses:
         """Impulses x in the form in which `warm_start` of the next step reads them."""
+        number = self.pairs.number
 
         def in_order() -> PileImpulses:
             """Impulses by increasing number, so that the next step can search for
             them.
             """
-            order = jnp.argsort(self.pairs.number)
-            return PileImpulses(self.pairs.number[order], x[order])
+            order = jnp.argsort(number)
+            return PileImpulses(number[order], x[order])
 
-        as_it_is = PileImpulses(self.pairs.number, x)
-        return jax.lax.cond(self.pairs.filled > 0, in_order, lambda: as_it_is)
+        as_it_is = PileImpulses(number, x)
+        some = self.pairs.filled > 0
+        return jax.lax.cond(some, in_order, lambda: as_it_is)
 
     def recorded(self, values: Float[Array, "*d"]) -> Float[Array, "*e"]:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
@@ -203,29 +223,35 @@ def contacts_of_step(
     Closed are those with a gap of at most `closed_below` [m] at one of these;
     directions and mass are those in the middle.
     """
-    at = seen_from_base(system, q, t)
+    seen = seen_from_base(system, q, t)
     end = seen_from_base(system, q_end, t_end)
     mass = mass_at(system, q)
     if is_pile(system):
-        pairs = system.body.active_pairs(at, end, closed_below)
+        pairs = system.body.active_pairs(seen, end, closed_below)
+        directions = pairs.directions
         if not friction:
-            pairs = pairs._replace(directions=pairs.directions[:, :1])
-        of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
+            normal = directions[:, :1]
+            pairs = pairs._replace(directions=normal)
+        velocities = directions.shape[-1]
+        of_bodies = 1 / mass.reshape(-1, velocities)
         inverse = jnp.pad(of_bodies, ((0, 1), (0, 0)))
         return ActiveContacts(pairs, inverse)
-    gap, normals, tangents = system.body.directions(at, friction)
+    gap, normals, tangents = system.body.directions(seen, friction)
     n, m = normals.shape
-    directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
+    normals_or_nan = normals + 0 * gap[None]  # NaN where the gap is
+    directions = normals_or_nan[:, :, None]
     if friction:
         assert tangents is not None
         by_contacts = tangents.reshape(n, m, -1)
         directions = jnp.concatenate([directions, by_contacts], axis=2)
-    gap_at_end = jnp.atleast_1d(system.body.gap_function(end))
-    least = jnp.minimum(gap, gap_at_end)
-    closed = ~(least > closed_below)  # NaN does not pass for open
+    f_end = system.body.gap_function(end)
+    gap_at_end = jnp.atleast_1d(f_end)
+    smallest = jnp.minimum(gap, gap_at_end)
+    closed = ~(smallest > closed_below)  # NaN does not pass for open
     directions = jnp.where(closed[:, None], directions, 0.0)
     columns = directions.reshape(n, -1)
-    moved = solve_mass_matrix(mass, columns).reshape(directions.shape)
+    solution = solve_mass_matrix(mass, columns)
+    moved = solution.reshape(directions.shape)
     matrix = jnp.tensordot(directions, moved, axes=([0], [0]))
     return AllContacts(gap, normals, closed, directions, moved, matrix)
 

@@ -182,11 +182,11 @@ def time_stepping(
     why = NotImplementedError(WHY)
     start, law, times = without_derivatives((start, law, times), why)
     between = times[1] - times[0]
-    h = between / substeps.astype(times.dtype)
-    friction = start.friction
-    problem = _StepProblem(start.system, law, friction, h, start.closed_below, joint)
-    first = _begin(problem, start.q, start.v, times, substeps, max_events)
     dtype = times.dtype
+    h = between / substeps.astype(dtype)
+    system = start.system
+    problem = _StepProblem(system, law, start.friction, h, start.closed_below, joint)
+    first = _begin(problem, start.q, start.v, times, substeps, max_events)
 
     def to_sample(progress: _Progress, t: Float[Array, ""]) -> tuple[_Progress, State]:
         """Motion from the sample at t to the next one, and the state there; NaN after a
@@ -197,21 +197,24 @@ def time_stepping(
             """Step number i from t, unless the motion has failed."""
 
             def go() -> _Progress:
-                return _one_step(problem, progress, t + i.astype(dtype) * h)
+                number = i.astype(dtype)
+                return _one_step(problem, progress, t + number * h)
 
             goes_on = progress.status == CODE["ok"]
             return jax.lax.cond(goes_on, go, lambda: progress)
 
         progress = jax.lax.fori_loop(0, substeps, one, progress)
         fine = progress.status == CODE["ok"]
-        state = jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
+        states = progress.state
+        state = jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), states)
         return progress, state
 
     end, later = jax.lax.scan(to_sample, first, times[:-1])
     samples = jax.tree.map(
         lambda x, rest: jnp.concatenate([x[None], rest]), first.state, later
     )
-    steps = substeps * (times.shape[0] - 1)
+    intervals = len(times) - 1
+    steps = substeps * intervals
     ended_well = end.status == CODE["ok"]
     status = jnp.where(ended_well, end.reported, end.status)
     return Course(samples, end.events, steps, status)
@@ -241,8 +244,10 @@ def step_of_pile(start: Start, law: Law) -> PileStep:
     status, reported = _status(problem, first, setup, trial, state)
     contacts = setup.contacts
     assert isinstance(contacts, ActiveContacts)
-    code = jnp.where(status > 0, status, reported)
-    return PileStep(contacts.pairs, trial.solution.impulse, trial.v, code)
+    fails = status > 0
+    code = jnp.where(fails, status, reported)
+    impulse = trial.solution.impulse
+    return PileStep(contacts.pairs, impulse, trial.v, code)
 
 
 def _begin(
@@ -257,44 +262,46 @@ def _begin(
     start.
     """
     system, law, mu, _, closed_below, _ = problem
-    zero = jnp.zeros((), q0.dtype)
     dtype = q0.dtype
-    m = recorded_gaps(system, q0, times[0]).shape[0]
+    zero = jnp.zeros((), dtype)
+    t0 = times[0]
+    rubs = mu is not None
+    m = len(recorded_gaps(system, q0, t0))
 
     def first() -> tuple[Float[Array, "m b"], Any]:
         """Rates of contacts, and impulses as steps keep them: their shapes are used
         alone.
         """
-        at = contacts_of_step(
-            system, q0, times[0], q0, times[0], closed_below, mu is not None
-        )
-        rates = at.rates(v0)
-        return rates, at.kept(rates)
+        contacts = contacts_of_step(system, q0, t0, q0, t0, closed_below, rubs)
+        rates = contacts.rates(v0)
+        return rates, contacts.kept(rates)
 
     shapes = jax.eval_shape(first)
     at_rest, impulses = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     contacts, b = at_rest.shape
     rest = jnp.zeros((2, m), dtype)
-    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
+    begin = State(q0, v0, t0, zero, zero, rest, rest[:0])
     if is_pile(system):
         rows = 1
     else:
         rows = max_events
-    events = no_events(rows, q0, v0, m, tangents=m * max(b - 1, 1))
+    directions = max(b - 1, 1)
+    events = no_events(rows, q0, v0, m, tangents=m * directions)
     status = status_at_start(system, begin, times[-1], closed_below)
-    fails = (status == CODE["ok"]) & ~within_domains(law)
+    fine = status == CODE["ok"]
+    fails = fine & ~within_domains(law)
     code = jnp.where(fails, CODE["law_failed"], status)
-    status = code.astype(jnp.int32)
+    long_ago = substeps * len(times)
     return _Progress(
         state=begin,
         speed=zero,
         last_impulses=impulses,
         residual_velocity=zero,
         inverse_step_size=jnp.ones((), dtype),
-        steps_since_impact=jnp.full(contacts, substeps * len(times)),
+        steps_since_impact=jnp.full(contacts, long_ago),
         closing=_closing_at_start(problem, begin, contacts),
         events=events,
-        status=status,
+        status=jnp.int32(code),
         reported=jnp.int32(CODE["ok"]),
     )
 
@@ -309,13 +316,14 @@ def _one_step(
     status, reported = _status(problem, progress, setup, trial, state)
     solution = trial.solution
     contacts = setup.contacts
+    later = progress.steps_since_impact + 1
     return _Progress(
         state=state,
         speed=setup.speed,
         last_impulses=contacts.kept(solution.impulse),
         residual_velocity=solution.residual_velocity,
         inverse_step_size=solution.inverse_step_size,
-        steps_since_impact=jnp.where(setup.strikes, 1, progress.steps_since_impact + 1),
+        steps_since_impact=jnp.where(setup.strikes, 1, later),
         closing=_closing_after(problem, progress, setup, trial),
         events=_recorded_impact(problem, progress.events, setup, trial, energy),
         status=status,
@@ -334,7 +342,8 @@ def _loads(
     contacts.
     """
     force = user_force(system, q, v, t)
-    return force, free_acceleration(system, q, v, force, mass)
+    free = free_acceleration(system, q, v, force, mass)
+    return force, free
 
 
 def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> _Setup:
@@ -345,46 +354,55 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
     """
     system, law, mu, h, closed_below, joint = problem
     state = progress.state
-    dtype = progress.state.q.dtype
+    q = state.q
+    v = state.v
+    dtype = q.dtype
     body = system.body
     middle = t + 0.5 * h
     end = t + h
-    q = body.moved(state.q, 0.5 * h * state.v)
-    base_velocity = carried_along(system, state.v, middle)
+    q = body.moved(q, 0.5 * h * v)
+    base_velocity = carried_along(system, v, middle)
     mass = mass_at(system, q)
-    free = _loads(system, q, state.v, middle, mass)[1]
-    v_end = state.v + h * free
+    _, free = _loads(system, q, v, middle, mass)
+    v_end = v + h * free
     q_predicted = body.moved(q, 0.5 * h * v_end)
     rubs = mu is not None
     contacts = contacts_of_step(system, q, middle, q_predicted, end, closed_below, rubs)
-    before = contacts.rates(state.v - base_velocity)
+    rates = contacts.rates(v - base_velocity)
+    gamma = rates[:, 0]
     rounding = precision(dtype).accumulated
-    speed = jnp.maximum(progress.speed, contacts.fastest(state.v))
-    tolerance = max(PILE if is_pile(system) else FEW, rounding)
-    noise = max(_ROUNDING, rounding) * speed + progress.residual_velocity
+    fastest = contacts.fastest(v)
+    speed = jnp.maximum(progress.speed, fastest)
+    if is_pile(system):
+        tolerance = max(PILE, rounding)
+    else:
+        tolerance = max(FEW, rounding)
+    share = max(_ROUNDING, rounding)
+    noise = share * speed + progress.residual_velocity
     noise += tolerance * contacts.fastest(h * free)
-    free_rates = jnp.abs(contacts.rates(free)[:, 0])
-    slow = noise + SLOW * h * free_rates
-    strikes = contacts.closed & (before[:, 0] < -slow)
+    by_loads = contacts.rates(free)[:, 0]
+    slow = noise + SLOW * h * jnp.abs(by_loads)
+    approaches = gamma < -slow
+    strikes = contacts.closed & approaches
     # half of the forces before an impact, half after it: over the whole step they take
     # as much energy from the velocities as the potential gains
-    if joint:
-        law_velocity = state.v
-    else:
-        law_velocity = state.v + 0.5 * h * free
-    impulse = jnp.zeros_like(before)
+    half = 0.5 * h
+    impulse = jnp.zeros_like(rates)
     law_status = jnp.int32(CODE["ok"])
-    if not joint:
+    if joint:
+        law_velocity = v
+    else:
+        law_velocity = v + half * free
         scene = scene_at(system, q, middle, contacts.closed)
         relative = law_velocity - base_velocity
+        shape = rates.shape
         impulse, law_status = jax.lax.cond(
             jnp.any(strikes),
-            lambda: _law_impulses(law, scene, relative, noise, before.shape),
+            lambda: _law_impulses(law, scene, relative, noise, shape),
             lambda: (impulse, law_status),
         )
-    rates = before + contacts.product(impulse)
-    by_loads = 0.5 * h * contacts.rates(free)[:, 0]
-    added = jnp.where(strikes, by_loads, 0.0)
+    rates = rates + contacts.product(impulse)
+    added = jnp.where(strikes, half * by_loads, 0.0)
     e, e_t = _coefficients(problem, strikes, dtype)
     offset, offset_for_mean = _offsets(e, e_t, rates, added)
     return _Setup(
@@ -421,7 +439,8 @@ def _coefficients(
         e = law.restitution
         if law.tangential_restitution is not None:
             e_t = law.tangential_restitution
-    return e, jnp.where(strikes, e_t, 0.0)
+    of_impacts = jnp.where(strikes, e_t, 0.0)
+    return e, of_impacts
 
 
 def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
@@ -435,11 +454,17 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
     h = problem.h
     contacts = setup.contacts
     v0 = progress.state.v
-    constant = system.force is None and not callable(system.mass)
+    constant_mass = not callable(system.mass)
+    constant = constant_mass and system.force is None
     if constant and system.body.coordinates is None:
-        least = 1
+        tries = 1
     else:
-        least = MEAN
+        tries = MEAN
+    if problem.mu is None:
+        mu = jnp.zeros((), v0.dtype)
+    else:
+        mu = problem.mu
+    closed = contacts.closed[:, None]
 
     def iteration(last: _Trial) -> _Trial:
         """Solution of the step with the loads at the mean velocity of the `last`
@@ -447,34 +472,39 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         """
         force, free = _loads(system, setup.q, last.mean, setup.middle, setup.mass)
         with_loads = setup.rates + h * contacts.rates(free)  # D^T v + h D^T a
-        for_mean = last.tries < least
+        for_mean = last.tries < tries
         offset = jnp.where(for_mean, setup.offset, setup.offset_for_mean)
         right_side = with_loads + offset
         solution = solve_many(
             contacts.product,
             contacts.diagonal,
-            jnp.where(contacts.closed[:, None], right_side, 0.0),
-            jnp.zeros((), v0.dtype) if problem.mu is None else problem.mu,
+            jnp.where(closed, right_side, 0.0),
+            mu,
             last.solution.impulse,
             last.solution.inverse_step_size,
             setup.tolerance,
             ITERATIONS,
         )
         x = solution.impulse
-        v = v0 + h * free + contacts.velocity_change(setup.law_impulse + x)
+        every_impulse = setup.law_impulse + x
+        v = v0 + h * free + contacts.velocity_change(every_impulse)
         after = with_loads + contacts.product(x)  # gamma' and slips
-        energy = 0.5 * jnp.vdot(x, setup.rates + after)
+        twice_mean = setup.rates + after
+        energy = 0.5 * jnp.vdot(x, twice_mean)
         rounding = setup.noise + solution.residual_velocity
-        adds_energy = energy > rounding * jnp.sum(jnp.abs(x))
+        allowed = rounding * jnp.sum(jnp.abs(x))
+        adds_energy = energy > allowed
         mean = 0.5 * (v0 + v)
-        return _Trial(v, mean, force, solution, adds_energy, last.tries + 1)
+        number = last.tries + 1
+        return _Trial(v, mean, force, solution, adds_energy, number)
 
     def goes_on(trial: _Trial) -> Bool[Array, ""]:
-        """True before `least` tries, then while energy is added, up to twice as
+        """True before `tries` trials, then while energy is added, up to twice as
         many.
         """
-        may_retry = trial.tries < 2 * least
-        return (trial.tries < least) | (trial.adds_energy & may_retry)
+        due = trial.tries < tries
+        may_retry = trial.tries < 2 * tries
+        return due | (trial.adds_energy & may_retry)
 
     zero = 0 * setup.speed
     begin = Many(
@@ -485,7 +515,8 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         inverse_step_size=progress.inverse_step_size,
     )
     no_force = jnp.zeros_like(v0)
-    start = _Trial(v0, v0, no_force, begin, jnp.asarray(False), jnp.int32(0))
+    no = jnp.asarray(False)
+    start = _Trial(v0, v0, no_force, begin, no, jnp.int32(0))
     return jax.lax.while_loop(goes_on, iteration, start)
 
 
@@ -502,17 +533,20 @@ def _end_state(
     state = progress.state
     contacts = setup.contacts
     x = setup.law_impulse + trial.solution.impulse
-    work = x * contacts.rates(trial.mean - setup.base_velocity)
+    relative = trial.mean - setup.base_velocity
+    work = x * contacts.rates(relative)
     by_normal = work[:, 0]
     by_friction = jnp.sum(work[:, 1:], axis=1)
     energy = jnp.stack([by_normal, by_friction])
+    half = 0.5 * h
+    by_contacts = contacts.generalized_impulse(x)
+    by_force = h * trial.force @ trial.mean
     new = state._replace(
-        q=problem.system.body.moved(setup.q, 0.5 * h * trial.v),
+        q=problem.system.body.moved(setup.q, half * trial.v),
         v=trial.v,
         t=setup.end,
-        work=state.work + h * trial.force @ trial.mean,
-        base_work=state.base_work
-        + contacts.generalized_impulse(x) @ setup.base_velocity,
+        work=state.work + by_force,
+        base_work=state.base_work + by_contacts @ setup.base_velocity,
         contact_work=state.contact_work + contacts.recorded(energy),
     )
     return new, energy
@@ -537,7 +571,8 @@ def _status(
     contacts = setup.contacts
     fails = jnp.asarray(FAILS)[setup.law_status]
     status = jnp.where(fails, CODE["law_failed"], progress.status)
-    status = jnp.where(out_of_range(system, state), CODE["out_of_range"], status)
+    outside = out_of_range(system, state)
+    status = jnp.where(outside, CODE["out_of_range"], status)
     if isinstance(contacts, ActiveContacts):
         status = jnp.where(contacts.pairs.overflows, CODE["room"], status)
     # a base that is NaN shows in its work, a coefficient in that of the contacts
@@ -547,30 +582,39 @@ def _status(
     status = jnp.where(finite, status, CODE["not_finite"])
     if callable(system.mass):
         finite_mass = jnp.all(jnp.isfinite(setup.mass))
-        positive_definite = definite(setup.mass) | ~finite_mass
-        status = jnp.where(positive_definite, status, CODE["singular_mass"])
+        positive = definite(setup.mass)
+        fine = positive | ~finite_mass
+        status = jnp.where(fine, status, CODE["singular_mass"])
     if isinstance(contacts, ActiveContacts):
-        velocities = trial.v.reshape(-1, contacts.inverse.shape[1])
-        places = (velocities.shape[1] + 1) // 2  # 2 of 3 in a plane, 3 of 6 in space
-        speeds = jnp.sum(velocities[:, :places] ** 2, axis=1)
-        path = problem.h * jnp.sqrt(jnp.max(speeds))
-        coarse = path > contacts.pairs.reach
+        _, size = contacts.inverse.shape  # 3 in a plane, 6 in space
+        velocities = trial.v.reshape(-1, size)
+        places = (size + 1) // 2  # 2 of 3 in a plane, 3 of 6 in space
+        of_places = velocities[:, :places]
+        squares = jnp.sum(of_places**2, axis=1)
+        fastest = jnp.sqrt(jnp.max(squares))
+        coarse = problem.h * fastest > contacts.pairs.reach
     else:
         relative = progress.state.v - setup.base_velocity
         rate = contacts.normals.T @ relative
-        struck_again = setup.strikes & (progress.steps_since_impact < APART)
-        struck_again &= rate < -HARD * setup.speed
+        recent = progress.steps_since_impact < APART
+        hard = rate < -HARD * setup.speed
+        struck_again = setup.strikes & recent & hard
         # a gap that was to close grows: bodies passed each other between two
         # evaluations of it
-        speeds = jnp.abs(contacts.normals).T @ jnp.abs(relative)
-        turned = rate - progress.closing > TURN * speeds + setup.slow
-        opens = (progress.closing < 0) & (rate > 0) & turned
+        normals = jnp.abs(contacts.normals)
+        speeds = normals.T @ jnp.abs(relative)
+        change = rate - progress.closing
+        turned = change > TURN * speeds + setup.slow
+        was_closing = progress.closing < 0
+        grows = rate > 0
+        opens = was_closing & grows & turned
         coarse = jnp.any(struck_again | opens)
     coarse = jnp.where(coarse, CODE["coarse_step"], 0)
     off = trial.solution.misfit > OFF
     unsolved = jnp.where(off, CODE["unsolved_step"], 0)
-    reported = jnp.maximum(progress.reported, jnp.maximum(coarse, unsolved))
-    return status.astype(jnp.int32), reported.astype(jnp.int32)
+    worse = jnp.maximum(coarse, unsolved)
+    reported = jnp.maximum(progress.reported, worse)
+    return jnp.int32(status), jnp.int32(reported)
 
 
 def _closing_at_start(
@@ -591,8 +635,11 @@ def _closing_at_start(
         moved = system.body.moved(q, s * v)
         return gaps(system, moved, t + s)
 
-    gap, rate = jax.jvp(later, (0 * t,), (jnp.ones_like(t),))
-    return _closing(gap, rate, 0.5 * problem.h, problem.closed_below)
+    no_time = 0 * t
+    one = jnp.ones_like(t)
+    gap, rate = jax.jvp(later, (no_time,), (one,))
+    half = 0.5 * problem.h
+    return _closing(gap, rate, half, problem.closed_below)
 
 
 def _closing_after(
@@ -604,7 +651,8 @@ def _closing_after(
     contacts = setup.contacts
     if isinstance(contacts, ActiveContacts):
         return progress.closing
-    rate = contacts.normals.T @ (trial.v - setup.base_velocity)
+    relative = trial.v - setup.base_velocity
+    rate = contacts.normals.T @ relative
     return _closing(contacts.gap, rate, problem.h, problem.closed_below)
 
 
@@ -615,7 +663,9 @@ def _closing(
     closed_below: Float[Array, ""],
 ) -> Float[Array, " m"]:
     """Rates [m/s] of open gaps with `gap + h rate < 0`, 0 elsewhere."""
-    closes = (gap > closed_below) & (gap + h * rate < 0)
+    is_open = gap > closed_below
+    penetrates = gap + h * rate < 0
+    closes = is_open & penetrates
     return jnp.where(closes, rate, 0.0)
 
 
@@ -640,7 +690,8 @@ def _recorded_impact(
     if problem.joint:
         x = x + trial.solution.impulse
     else:
-        after = setup.law_velocity + contacts.velocity_change(x)
+        by_law = contacts.velocity_change(x)
+        after = setup.law_velocity + by_law
     row = {
         "time": setup.middle,
         "kind": jnp.int32(KIND_CODE["impact"]),
@@ -652,9 +703,11 @@ def _recorded_impact(
         "energy": energy,
         "status": setup.law_status,
     }
-    if x.shape[1] > 1:
-        row["tangential_impulse"] = x[:, 1:].reshape(-1)
-    return with_row(events, jnp.any(setup.strikes), row)
+    tangential = x[:, 1:]
+    if tangential.size:
+        row["tangential_impulse"] = tangential.reshape(-1)
+    happened = jnp.any(setup.strikes)
+    return with_row(events, happened, row)
 
 
 def _offsets(
@@ -680,9 +733,12 @@ def _offsets(
     """
     gamma = rates[:, 0]
     struck = e * (gamma + added) - added
-    normal = jnp.where(gamma < 0, struck, gamma)[:, None]
+    approaches = gamma < 0
+    w_n = jnp.where(approaches, struck, gamma)
+    normal = w_n[:, None]
     slip = rates[:, 1:]
-    at_end = jnp.concatenate([normal, e_t[:, None] * slip], axis=1)
+    w_t = e_t[:, None] * slip
+    at_end = jnp.concatenate([normal, w_t], axis=1)
     for_mean = jnp.concatenate([normal, slip], axis=1)
     return at_end, for_mean
 
@@ -699,7 +755,8 @@ def _law_impulses(
     """
     out: Any = impact(law, scene, v, noise)
     x = out.impulse[:, None]
-    if shape[1] > 1:
-        side = out.tangential_impulse.reshape(shape[0], -1)
+    m, b = shape
+    if b > 1:
+        side = out.tangential_impulse.reshape(m, -1)
         x = jnp.concatenate([x, side], axis=1)
     return x, out.status

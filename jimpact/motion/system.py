@@ -144,7 +144,8 @@ class System(eqx.Module):
                 raise ValueError(
                     "Argument `potential` must not be given besides `gravity`."
                 )
-            potential = self.body.gravity(_acceleration_of(gravity))
+            acceleration = _acceleration_of(gravity)
+            potential = self.body.gravity(acceleration)
         self.force = force
         self.potential = potential
         self.base = base
@@ -160,15 +161,7 @@ class System(eqx.Module):
                 "Argument `base_directions` must be given with `base`, and only with "
                 "it."
             )
-        self.base_directions = None
-        if base_directions is not None:
-            self.base_directions = as_float_array("base_directions", base_directions)
-            check_values("base_directions", self.base_directions)
-            if self.base_directions.ndim != 2:
-                raise ValueError(
-                    "Argument `base_directions` must have shape (n, d), but has shape "
-                    f"{self.base_directions.shape}."
-                )
+        self.base_directions = _directions_of_base(base_directions)
 
     @property
     def gap_function(self) -> Callable[[jax.Array], jax.Array]:
@@ -186,15 +179,30 @@ class System(eqx.Module):
         return self.body.mass
 
 
+def _directions_of_base(directions: Any) -> Float[Array, "n d"] | None:
+    """Directions B (n, d) of a base, checked; None without a base."""
+    if directions is None:
+        return None
+    b = as_float_array("base_directions", directions)
+    check_values("base_directions", b)
+    if b.ndim != 2:
+        raise ValueError(
+            "Argument `base_directions` must have shape (n, d), but has shape "
+            f"{b.shape}."
+        )
+    return b
+
+
 def _acceleration_of(gravity: Any) -> Float[Array, ""]:
     """Size >= 0 [m/s^2] of an acceleration that points downwards; True: the standard
     one.
     """
-    acceleration = as_float_array(
-        "gravity", STANDARD_GRAVITY if gravity is True else gravity
-    )
+    if gravity is True:
+        gravity = STANDARD_GRAVITY
+    acceleration = as_float_array("gravity", gravity)
     check_shape("gravity", acceleration, (), "the size of the acceleration")
-    if not is_traced(acceleration) and float(acceleration) < 0:
+    known = not is_traced(acceleration)
+    if known and float(acceleration) < 0:
         raise ValueError(
             "Argument `gravity` must be >= 0, the size of an acceleration that points "
             f"downwards, but has value {float(acceleration):g} m/s^2."
@@ -229,10 +237,12 @@ def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> Potenti
     """
     check_values("acceleration", acceleration)
     if isinstance(mass_along_up, Body):
-        return mass_along_up.gravity(as_float_array("acceleration", acceleration))
+        g = as_float_array("acceleration", acceleration)
+        return mass_along_up.gravity(g)
     weights = as_float_array("mass_along_up", mass_along_up)
     check_values("mass_along_up", weights)
-    return LinearPotential(weights * jnp.asarray(acceleration, weights.dtype))
+    g = jnp.asarray(acceleration, weights.dtype)
+    return LinearPotential(weights * g)
 
 
 DIRECTIONS = ("line", "vertical", "horizontal")
@@ -275,7 +285,8 @@ class HarmonicBase(eqx.Module):
 
     def __call__(self, t: Any) -> Float[Array, " d"]:
         """Displacement [m] along the line, or (x, y)."""
-        angle = 2 * jnp.pi * self.frequency * t + self.phase
+        omega = 2 * jnp.pi * self.frequency
+        angle = omega * t + self.phase
         y = self.amplitude * jnp.sin(angle)
         if self.direction == "line":
             return y[None]
@@ -316,7 +327,8 @@ def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
         _check_returned("force", force, f"({n},), one per velocity", force == (n,))
     if system.potential is not None:
         energy = _shape_of("potential", system.potential, {"q": q}, precision)
-        _check_returned("potential", energy, "(), an energy", energy == ())
+        is_scalar = energy == ()
+        _check_returned("potential", energy, "(), an energy", is_scalar)
     if system.base is not None:
         assert system.base_directions is not None
         d = system.base_directions.shape[1]
@@ -367,7 +379,8 @@ def _shape_of(
     if whole:
         return out.shape
     bits = jnp.finfo(out.dtype).bits
-    if bits > jnp.finfo(precision).bits:
+    allowed = jnp.finfo(precision).bits
+    if bits > allowed:
         raise TypeError(
             f"Argument `system` must compute in the precision of `q0`, {precision}, "
             f"but its "

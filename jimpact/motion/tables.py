@@ -56,10 +56,12 @@ class MotionProblem(NamedTuple):
     @property
     def start(self) -> State:
         """State at the beginning, of rigid contacts: no work has been done."""
-        zero = jnp.zeros((), self.q0.dtype)
-        rest = jnp.zeros((2, self.contacts), self.q0.dtype)
-        begin = (self.q0, self.v0, self.times[0])
-        return State(*begin, zero, zero, rest, rest[:0])
+        q = self.q0
+        dtype = q.dtype
+        zero = jnp.zeros((), dtype)
+        rest = jnp.zeros((2, self.contacts), dtype)
+        t = self.times[0]
+        return State(q, self.v0, t, zero, zero, rest, rest[:0])
 
 
 class Course(NamedTuple):
@@ -92,13 +94,15 @@ class MotionTable(NamedTuple):
     ) -> "MotionTable":
         """The table with an event in this row; see `event_numbers` and `marks`."""
         events = put(self.events, numbers, row)
-        new_marks = put(self.marks, marks.astype(jnp.int32), row)
+        whole = jnp.int32(marks)
+        new_marks = put(self.marks, whole, row)
         return self._replace(events=events, marks=new_marks)
 
     def with_sample(self, state: State, row: Int[Array, ""]) -> "MotionTable":
         """The table with this state as the sample of this row."""
         state_row = packed(state)[:, 0]
-        return self._replace(samples=put(self.samples, state_row, row))
+        samples = put(self.samples, state_row, row)
+        return self._replace(samples=samples)
 
 
 class MotionEnd(NamedTuple):
@@ -126,25 +130,32 @@ def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
         NaN.
         """
         index = jnp.arange(len(rows), dtype=count.dtype)
-        there = (index < count) | (index == len(rows) - 1)
+        last = len(rows) - 1
+        there = (index < count) | (index == last)
         constant = jax.lax.stop_gradient(rows)
         some = jnp.where(there[:, None], rows, constant)
-        return some + nan_derivatives(problem, there).astype(rows.dtype)
+        unknown = nan_derivatives(problem, there)
+        return some + unknown.astype(rows.dtype)
 
-    samples = known(end.table.samples, jnp.minimum(end.reached, end.smooth[0]))
-    events = known(end.table.events, jnp.minimum(end.event_count, end.smooth[1]))
-    return end._replace(table=MotionTable(samples, events, end.table.marks))
+    table = end.table
+    sample_count = jnp.minimum(end.reached, end.smooth[0])
+    event_count = jnp.minimum(end.event_count, end.smooth[1])
+    samples = known(table.samples, sample_count)
+    events = known(table.events, event_count)
+    known_table = table._replace(samples=samples, events=events)
+    return end._replace(table=known_table)
 
 
 def empty_table(problem: MotionProblem, start: State, max_events: int) -> MotionTable:
     """Table of a motion that begins in this state, its first sample; other rows are
     0.
     """
-    return MotionTable(
-        no_samples(start, problem.times),
-        jnp.zeros((max_events + 1, event_width(problem)), start.q.dtype),
-        jnp.zeros((max_events + 1, 2 + problem.contacts), jnp.int32),
-    )
+    rows = max_events + 1
+    width = event_width(problem)
+    samples = no_samples(start, problem.times)
+    events = jnp.zeros((rows, width), start.q.dtype)
+    marks = jnp.zeros((rows, 2 + problem.contacts), jnp.int32)
+    return MotionTable(samples, events, marks)
 
 
 def no_samples(start: State, targets: Float[Array, " S"]) -> Float[Array, "S+1 rows"]:
@@ -152,7 +163,8 @@ def no_samples(start: State, targets: Float[Array, " S"]) -> Float[Array, "S+1 r
     discards.
     """
     row = packed(start)[:, 0]
-    table = jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype)
+    count = len(targets) + 1
+    table = jnp.zeros((count, len(row)), row.dtype)
     return table.at[0].set(row)
 
 
@@ -171,7 +183,8 @@ def nan_derivatives(inputs: Any, known: Bool[Array, " r"]) -> Float[Array, "r 1"
     what nobody differentiates (a cotangent of 0) leaves the gradient as it is.
     """
     arrays = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
-    return _undetermined(arrays, ~known)[:, None]
+    unknown = _undetermined(arrays, ~known)
+    return unknown[:, None]
 
 
 @jax.custom_jvp
@@ -194,17 +207,21 @@ def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.A
     infinite or NaN unless all dx_j are 0, as are its own derivatives.
     """
     arrays, unknown = primals
-    flat = jnp.concatenate([jnp.where(jnp.isfinite(x), x, 0.0).ravel() for x in arrays])
+    finite = [jnp.where(jnp.isfinite(x), x, 0.0).ravel() for x in arrays]
+    flat = jnp.concatenate(finite)
     flat = _reversed(flat)  # and an infinite cotangent becomes NaN
-    slope = jnp.cos(1 + flat @ _weights(flat.size))
+    weights = _weights(flat.size)
+    slope = jnp.cos(1 + flat @ weights)
     some = jnp.any(unknown)
     # large, not yet NaN, on either side of the slope: its own derivative may be
     # multiplied by 0
-    total = sum(
-        jnp.sum(_enlarged(slope * _enlarged(x, some), some)) for x in tangents[0]
-    )
-    each = jnp.where(unknown, total * _weights(unknown.size), 0.0)
-    return jnp.where(unknown, 0.0, 0.0), each.astype(float)
+    large = (_enlarged(x, some) for x in tangents[0])
+    parts = (_enlarged(slope * x, some) for x in large)
+    total = sum(map(jnp.sum, parts))
+    zero = jnp.where(unknown, 0.0, 0.0)
+    derivatives = total * _weights(unknown.size)
+    tangent = jnp.where(unknown, derivatives, 0.0)
+    return zero, tangent.astype(float)
 
 
 def _weights(count: int) -> np.ndarray:
@@ -247,21 +264,16 @@ def event_width(problem: MotionProblem) -> int:
     )
 
 
-def event_numbers(before: State, after: After) -> Float[Array, " w"]:
+def event_numbers(old: State, after: After) -> Float[Array, " w"]:
     """Row of an event: t, q, v-, v+, impulses (m, then t), energies (2 m), time and gap
     passed.
     """
     jump = after.jump
-    parts = (
-        before.t,
-        before.q,
-        before.v,
-        jump.v,
-        jump.impulse,
-        jump.tangential,
-        jump.energy,
-    )
-    return ravel_pytree((parts, after.passed))[0]
+    velocities = (old.v, jump.v)
+    impulses = (jump.impulse, jump.tangential)
+    parts = (old.t, old.q, *velocities, *impulses, jump.energy)
+    flat, _ = ravel_pytree((parts, after.passed))
+    return flat
 
 
 def recorded_events(
@@ -278,14 +290,15 @@ def recorded_events(
     m = problem.contacts
     others = (problem.q0.size, n, n, m, problem.tangents, 2 * m)
     sizes = np.cumsum([1, *others])
-    time, q, before, after, impulse, side, energy, passed = jnp.split(
-        rows, sizes, axis=1
-    )
-    ends = marks[:, 0] == KIND_CODE["accumulation"]
+    parts = jnp.split(rows, sizes, axis=1)
+    time, q, before, after, impulse, side, energy, passed = parts
+    kind = marks[:, 0]
+    ends = kind == KIND_CODE["accumulation"]
+    later = time[:, 0] + passed[:, 0]
     return Events(
         count=count,
         time=time[:, 0],
-        kind=marks[:, 0],
+        kind=kind,
         contacts=marks[:, 2:] > 0,
         q=q,
         velocity_before=before,
@@ -294,6 +307,6 @@ def recorded_events(
         tangential_impulse=side,
         energy=energy.reshape(-1, 2, m),
         status=marks[:, 1],
-        accumulation_end=jnp.where(ends, time[:, 0] + passed[:, 0], jnp.nan),
+        accumulation_end=jnp.where(ends, later, jnp.nan),
         accumulation_gap=jnp.where(ends, passed[:, 1], jnp.nan),
     )

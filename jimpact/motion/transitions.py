@@ -101,8 +101,10 @@ def scene_at(
     """
     seen = seen_from_base(system, q, t)
     _, normals, tangents = system.body.directions(seen)
-    away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
-    return Scene(mass_at(system, q), normals, tangents, away)
+    away = jnp.where(closed, 0.0, jnp.inf)
+    gap = away.astype(q.dtype)
+    mass = mass_at(system, q)
+    return Scene(mass, normals, tangents, gap)
 
 
 def impact_jump(
@@ -120,25 +122,28 @@ def impact_jump(
     `p_t . H^T (v- + v+) / 2`, the base `(N p + H p_t) . B y_b'`. Gap velocities up to
     `noise` [m/s] are rounding; `approach`: see `impact`.
     """
-    m = closed.shape[0]
+    m = len(closed)
     scene = scene_at(system, state.q, t, closed)
+    normals = scene.normals
     carried = carried_along(system, state.v, t)
     relative = state.v - carried
     out = impact(law, scene, relative, noise, approach)
+    p = out.impulse
     mean = 0.5 * (out.velocity + relative)
-    push = scene.normals @ out.impulse
-    normal = (scene.normals.T @ mean) * out.impulse
-    tangential = jnp.zeros(m, normal.dtype)
+    push = normals @ p
+    normal = (normals.T @ mean) * p
+    p_t = jnp.zeros(m, normal.dtype)
     friction = jnp.zeros(m, normal.dtype)
     if scene.tangents is not None:
-        tangential = out.tangential_impulse
-        work = (scene.tangents.T @ mean) * tangential
+        p_t = out.tangential_impulse
+        slip = scene.tangents.T @ mean
+        work = slip * p_t
         friction = by_contact(work, m).sum(axis=1)
-        push = push + scene.tangents @ tangential
+        push = push + scene.tangents @ p_t
     energy = jnp.stack([normal, friction])
     v = out.velocity + carried
     base_work = push @ carried
-    return Jump(v, out.impulse, tangential, energy, base_work, out.status)
+    return Jump(v, p, p_t, energy, base_work, out.status)
 
 
 def tangent_count_of(system: System, q: Float[Array, " nq"], m: int) -> int:
@@ -146,7 +151,8 @@ def tangent_count_of(system: System, q: Float[Array, " nq"], m: int) -> int:
     tangents = jax.eval_shape(system.body.tangents, q)
     if tangents is None:
         return m
-    return int(tangents.shape[1])
+    _, count = tangents.shape
+    return int(count)
 
 
 class Passed(NamedTuple):
@@ -189,7 +195,7 @@ def resolve(
     mu: Float[Array, " m"] | None,
     settings: Settings,
     state: State,
-    before: Modes,
+    old: Modes,
     fired: Bool[Array, " f"],
     scales: Scales,
     struck: Bool[Array, " m"],
@@ -199,7 +205,7 @@ def resolve(
     new modes.
 
     Args:
-        before: modes up to now.
+        old: modes up to now.
         fired: (m,), with friction (2 m,) margins that have come to 0.
         scales: largest values of the motion so far.
         struck: contacts that had an impact before.
@@ -222,24 +228,27 @@ def resolve(
     that at the end of the sequence.
     """
     strike = _impact_if_any(system, law, settings, state, scales, approach)
-    # f' = 0
-    rests = jnp.abs(strike.contacts.normal.rate) <= strike.rest
+    gamma = strike.contacts.normal.rate
+    rests = jnp.abs(gamma) <= strike.rest  # f' = 0
     tight = strike.closed & rests
-    m = before.active.shape[0]
+    m = len(gamma)
     stopped = jnp.zeros(m, bool)
     if settings.spatial:
-        fired, stopped = _fired_in_space(settings, strike, before, fired)
+        fired, stopped = _fired_in_space(settings, strike, old, fired)
     result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight, stopped)
     jump = result.jump
     at_rest = state._replace(v=jump.v)
     choice, held, released = _next_modes(
-        system, mu, settings, strike, result, at_rest, before, fired
+        system, mu, settings, strike, result, at_rest, old, fired
     )
     status, code, next_approach = _status(strike, jump, choice, held)
-    any_fired = jnp.any(fired.reshape(-1, m), axis=0)  # of the margins of each contact
-    takes_part = jnp.where(strike.happens, jump.impulse != 0, any_fired)
+    of_contacts = fired.reshape(-1, m)
+    any_fired = jnp.any(of_contacts, axis=0)
+    pushed = jump.impulse != 0
+    takes_part = jnp.where(strike.happens, pushed, any_fired)
     taking_part = takes_part | choice.parts
-    after = After(_with_jump(state, jump), jump, result.passed)
+    end = _with_jump(state, jump)
+    after = After(end, jump, result.passed)
     parts = released[:m] | choice.parts
     any_ends = jnp.any(result.ends)
     kind = _kind(strike.happens, strike.jams, any_ends, parts, fired)
@@ -259,7 +268,7 @@ def resolve(
 
 def slip_stops(
     settings: Settings,
-    before: Modes,
+    old: Modes,
     fired: Bool[Array, " m"],
     speed: Float[Array, " m"],
     speed_scale: Float[Array, ""],
@@ -270,14 +279,15 @@ def slip_stops(
     In space only where its slip `speed` [m/s] is at most STOPPED of the scale: a step
     may turn slip by so much that it lands on `u . d = 0` although slip goes on.
     """
-    slid = fired & ~before.stick
-    if settings.spatial:
-        return slid & (speed <= STOPPED * speed_scale)
-    return slid
+    slid = fired & ~old.stick
+    if not settings.spatial:
+        return slid
+    slow = speed <= STOPPED * speed_scale
+    return slid & slow
 
 
 def _fired_in_space(
-    settings: Settings, strike: "_Strike", before: Modes, fired: Bool[Array, " f"]
+    settings: Settings, strike: "_Strike", old: Modes, fired: Bool[Array, " f"]
 ) -> tuple[Bool[Array, " f"], Bool[Array, " m"]]:
     """Margins that have fired (2 m,) without those that are no events, and stopped
     contacts (m,).
@@ -286,10 +296,12 @@ def _fired_in_space(
     longer only begin: these are no events.
     """
     assert strike.contacts.tangent is not None
-    m = before.active.shape[0]
-    speed = length(by_contact(strike.contacts.tangent.rate, m))
-    stopped = slip_stops(settings, before, fired[m:], speed, strike.scales.speed)
-    of_friction = fired[m:] & (before.stick | stopped)
+    m = len(old.active)
+    u = by_contact(strike.contacts.tangent.rate, m)
+    margins = fired[m:]
+    stopped = slip_stops(settings, old, margins, length(u), strike.scales.speed)
+    changes = old.stick | stopped
+    of_friction = margins & changes
     return fired.at[m:].set(of_friction), stopped
 
 
@@ -297,7 +309,7 @@ class _Strike(NamedTuple):
     """An event after its impact, if there is one."""
 
     t: Float[Array, ""]
-    before: Contacts
+    earlier: Contacts  # with the velocities before it
     contacts: Contacts  # with the velocities after it
     closed: Bool[Array, " m"]
     happens: Bool[Array, ""]  # there is an impact
@@ -322,19 +334,20 @@ def _impact_if_any(
     Its jump is empty where neither is so.
     """
     t = state.t
-    before = contacts_at(system, state.q, state.v, t, settings.friction)
-    closed = before.normal.value <= settings.closed_below
-    scales = _largest_scales(system, settings, scales, before, state)
+    contacts = contacts_at(system, state.q, state.v, t, settings.friction)
+    normal = contacts.normal
+    closed = normal.value <= settings.closed_below
+    scales = _largest_scales(system, settings, scales, contacts, state)
     rest = _rest_speed(settings, scales)
     jams = approach > 0
-    approaches = closed & (before.normal.rate < -rest)
-    strikes = jnp.any(approaches) | jams
+    approaches = normal.rate < -rest
+    strikes = jnp.any(closed & approaches) | jams
     jump = _jump_if(strikes, system, law, settings, state, approach, closed, scales)
-    contacts = contacts_at(system, state.q, jump.v, t, settings.friction)
+    after = contacts_at(system, state.q, jump.v, t, settings.friction)
     return _Strike(
         t=t,
-        before=before,
-        contacts=contacts,
+        earlier=contacts,
+        contacts=after,
         closed=closed,
         happens=strikes,
         jams=jams,
@@ -363,46 +376,56 @@ def _brought_slow_to_rest(
     contacts = strike.contacts
     scales = strike.scales
     closed = strike.closed
-    m = tight.shape[0]
+    m = len(tight)
+    through = ~strike.jams
     gamma = contacts.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
     # a hop below the rounding of gaps is none: it would strike faster than it left
-    least_hop = 2 * scales.acceleration * settings.gap_rounding
-    slowly = jnp.maximum(slowly, jnp.sqrt(least_hop))
-    slowly = jnp.maximum(slowly, SUPPLIED * strike.approach)
+    smallest_hop = 2 * scales.acceleration * settings.gap_rounding
+    of_hop = jnp.sqrt(smallest_hop)
+    slowly = jnp.maximum(slowly, of_hop)
+    supplied = SUPPLIED * strike.approach
+    slowly = jnp.maximum(slowly, supplied)
     stick = jnp.zeros(m, bool)
     if contacts.tangent is not None:
-        slip = length(by_contact(contacts.tangent.rate, m))
-        stick = stopped | (slip <= slowly)
+        u = by_contact(contacts.tangent.rate, m)
+        stick = stopped | (length(u) <= slowly)
 
     def resting(slow: Bool[Array, " m"]) -> _Resting:
         """Velocities after the `slow` contacts that would come back are stopped.
 
         These have a positive force in `0 <= lambda _|_ W lambda + approach >= 0`.
         """
-        pressed, kept_closed, force = pressed_together(contacts, slow, _slack(strike))
+        slack = _slack(strike)
+        pressed, kept_closed, force = pressed_together(contacts, slow, slack)
         stopped = tight | (slow & pressed)
         stop = _brought_to_rest(
             system, contacts, mu, stopped, stick, strike.t, strike.jump
         )
         # redundant contacts come to rest with others
         left = gamma + contacts.delassus[:m] @ stop.impulse  # gap velocities after it
-        at_rest = closed & (jnp.abs(left) <= strike.rest)
+        rests = jnp.abs(left) <= strike.rest
+        at_rest = closed & rests
         # a contact accumulates if it was brought to rest from more than rounding
-        ends = at_rest & ~tight & strike.happens & ~strike.jams
-        passed = _passed(stop, ends, -jnp.sum(strike.jump.energy))
+        moved = at_rest & ~tight
+        ends = moved & strike.happens & through
+        lost = -jnp.sum(strike.jump.energy)
+        passed = _passed(stop, ends, lost)
         return _Resting(pressed, kept_closed, at_rest, force, ends, stop.jump, passed)
 
-    slow = closed & (jnp.abs(gamma) <= slowly)
+    size = jnp.abs(gamma)
+    slow = closed & (size <= slowly)
     if m == 1:
         return resting(slow)
     shares = _share_bodies(contacts, closed | struck)
     faster = jnp.sqrt(settings.accumulation) * scales.gap_velocity
-    nested = closed & strike.happens & ~strike.jams & shares
-    nested = nested & (jnp.abs(gamma) <= faster)
+    struck_now = closed & strike.happens & through
+    nested = struck_now & shares & (size <= faster)
     both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
-    alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+    alone = jax.tree.map(lambda x: x[0], both)
+    cluster = jax.tree.map(lambda x: x[-1], both)
     undisturbed = _undisturbed(system, contacts, cluster, strike.t)
+
     return choose(undisturbed, cluster, alone)
 
 
@@ -410,7 +433,8 @@ def _slack(strike: _Strike) -> Float[Array, ""]:
     """Gap acceleration [m/s^2] below which it is rounding: a share of the largest
     one.
     """
-    return rest_acceleration(strike.rest.dtype) * strike.scales.acceleration
+    share = rest_acceleration(strike.rest.dtype)
+    return share * strike.scales.acceleration
 
 
 def _next_modes(
@@ -420,7 +444,7 @@ def _next_modes(
     strike: _Strike,
     result: "_Resting",
     state: State,
-    before: Modes,
+    old: Modes,
     fired: Bool[Array, " f"],
 ) -> tuple[ModeChoice, Bool[Array, " m"], Bool[Array, " f"]]:
     """Modes after an event, by complementarity of forces and accelerations at resting
@@ -440,21 +464,23 @@ def _next_modes(
     if mu is not None:
         contacts = contacts_at(system, state.q, state.v, strike.t, friction=True)
     held = result.at_rest
-    if not settings.friction:
-        held_before = before.active
-    else:
-        held_before = jnp.tile(before.active, 2)
-    released = fired & held_before & ~strike.happens
+    active = old.active
+    if settings.friction:
+        active = jnp.tile(active, 2)
+    released = fired & active & ~strike.happens
     if mu is not None:
         slack = _slack(strike)
-        choice = _with_friction(contacts, mu, before, held, released, rest, slack)
+        choice = _with_friction(contacts, mu, old, held, released, rest, slack)
         return choice, held, released
-    m = held.shape[0]
-    active = result.pressed | (held & result.kept_closed & ~released)
+    m = len(held)
+    stays = held & result.kept_closed & ~released
+    persistent = result.pressed | stays
     no = jnp.asarray(False)
-    modes = no_modes(m, rest.dtype)._replace(active=active)
+    modes = no_modes(m, rest.dtype)
+    modes = modes._replace(active=persistent)
     none = jnp.zeros(m, bool)
-    return ModeChoice(modes, ~no, rest, no, none), held, released
+    choice = ModeChoice(modes, ~no, rest, no, none)
+    return choice, held, released
 
 
 def _status(
@@ -467,20 +493,23 @@ def _status(
     are not consistent and a contact at rest (`held`) slips. Where it changed nothing,
     or none is possible, the status is `no_contact_force`.
     """
-    fails = jnp.asarray(FAILS)[jump.code]
+    failures = jnp.asarray(FAILS)
+    fails = failures[jump.code]
     status = jnp.where(fails, CODE["law_failed"], CODE["ok"])
     code = jump.code
     next_approach = jnp.zeros_like(strike.rest)
     now = strike.contacts.tangent
-    earlier = strike.before.tangent
+    earlier = strike.earlier.tangent
     if now is not None and earlier is not None:
         change = jnp.max(jnp.abs(now.rate - earlier.rate))
         if not in_space(strike.contacts):
             approach = _approach(choice, now.rate, held)
             next_approach = jnp.where(choice.consistent, 0.0, approach)
-        jammed = strike.jams & (change <= SUPPLIED * strike.approach)
-        none = jammed | (~choice.consistent & (next_approach == 0))
-        status = jnp.where(none, CODE["no_contact_force"], status)
+        in_vain = change <= SUPPLIED * strike.approach
+        jammed = strike.jams & in_vain
+        no_impact = next_approach == 0
+        stuck = ~choice.consistent & no_impact
+        status = jnp.where(jammed | stuck, CODE["no_contact_force"], status)
         with_several = jnp.maximum(code, CODE["several_outcomes"])
         code = jnp.where(choice.several, with_several, code)
     return status, code, next_approach
@@ -502,12 +531,15 @@ def _share_bodies(contacts: Contacts, touched: Bool[Array, " m"]) -> Bool[Array,
     """True where a contact i is coupled to a `touched` one j:
     `|W_ij| > eps sqrt(W_ii W_jj)`.
     """
-    m = touched.shape[0]
+    m = len(touched)
     w = jnp.abs(contacts.delassus[:m, :m])
     size = jnp.sqrt(jnp.diagonal(w))
-    others = touched[None] & ~jnp.eye(m, dtype=bool)
-    coupled = w > LEAST_COUPLING * jnp.outer(size, size)
-    return jnp.any(others & coupled, axis=1)
+    itself = jnp.eye(m, dtype=bool)
+    others = touched[None] & ~itself
+    scale = jnp.outer(size, size)
+    coupled = w > LEAST_COUPLING * scale
+    to_touched = others & coupled
+    return jnp.any(to_touched, axis=1)
 
 
 def _undisturbed(
@@ -518,23 +550,27 @@ def _undisturbed(
     Gaps fall as parabolas `f + f' s + f'' s^2 / 2` with the forces of the resting
     contacts.
     """
-    m = result.at_rest.shape[0]
+    m = len(result.at_rest)
+    v = result.jump.v
     gap = jnp.maximum(contacts.normal.value, 0.0)
     normals = contacts.normal.gradient
-    carried = carried_along(system, result.jump.v, t)
-    rate = normals.T @ (result.jump.v - carried)
+    carried = carried_along(system, v, t)
+    rate = normals.T @ (v - carried)
     by_force = contacts.delassus[:m, :m] @ result.force
     fall = contacts.approach[:m] + by_force
     square = rate * rate - 2 * fall * gap
     root = jnp.sqrt(jnp.maximum(square, 0.0))
     # time of the zero: with f' < 0 in a form without cancellation
-    falling = jnp.where(fall < 0, -fall, 1.0)
+    falls = fall < 0
+    falling = jnp.where(falls, -fall, 1.0)
     later = (rate + root) / falling
-    reached = quotient(2 * gap, root - rate, where=rate < 0, otherwise=later)
+    approaches = rate < 0
+    reached = quotient(2 * gap, root - rate, where=approaches, otherwise=later)
     rises = (rate >= 0) & (fall >= 0)
     never = (square < 0) | rises
     too_late = reached > result.passed.time
-    return jnp.all(result.at_rest | never | too_late)
+    free = result.at_rest | never | too_late
+    return jnp.all(free)
 
 
 def _approach(
@@ -545,10 +581,12 @@ def _approach(
 
     The share is the root of rounding, and MORE of what is left of the regularity.
     """
-    most = 2 * precision(slip.dtype).root
-    left = jnp.clip(choice.regularity, 0.0, most)
-    share = precision(slip.dtype).root + MORE * left
-    fastest = jnp.max(jnp.where(held, jnp.abs(slip), 0.0))
+    root = precision(slip.dtype).root
+    left = jnp.clip(choice.regularity, 0.0, 2 * root)
+    share = root + MORE * left
+    speed = jnp.abs(slip)
+    of_held = jnp.where(held, speed, 0.0)
+    fastest = jnp.max(of_held)
     return jax.lax.stop_gradient(share * fastest)
 
 
@@ -559,7 +597,8 @@ def velocity_noise(
     time.
     """
     duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
-    return precision(duration.dtype).accumulated * duration * acceleration
+    rounding = precision(duration.dtype).accumulated
+    return rounding * duration * acceleration
 
 
 def _rest_speed(settings: Settings, scales: Scales) -> Float[Array, ""]:
@@ -567,7 +606,8 @@ def _rest_speed(settings: Settings, scales: Scales) -> Float[Array, ""]:
     `velocity_noise`.
     """
     rounding = velocity_noise(settings, scales.acceleration)
-    return not_rounding(REST_SPEED, rounding.dtype) * scales.speed + rounding
+    share = not_rounding(REST_SPEED, rounding.dtype)
+    return share * scales.speed + rounding
 
 
 def _jump_if(
@@ -586,11 +626,12 @@ def _jump_if(
     else:
         lead = None
     noise = _rest_speed(settings, scales)
-    m = closed.shape[0]
+    m = len(closed)
+    tangents = tangent_count_of(system, state.q, m)
     return jax.lax.cond(
         strikes,
         lambda: impact_jump(system, law, state.t, state, closed, noise, lead),
-        lambda: no_jump(state, m, tangent_count_of(system, state.q, m)),
+        lambda: no_jump(state, m, tangents),
     )
 
 
@@ -606,7 +647,7 @@ def _with_jump(state: State, jump: Jump) -> State:
 def _with_friction(
     contacts: Contacts,
     mu: Float[Array, " m"],
-    before: Modes,
+    old: Modes,
     held: Bool[Array, " m"],
     released: Bool[Array, " 2*m"],
     rest: Float[Array, ""],
@@ -614,8 +655,9 @@ def _with_friction(
 ) -> ModeChoice:
     """`choose_with_friction` of the `held` contacts; slips above `rest` [m/s] slide."""
     assert contacts.tangent is not None
-    slides = length(by_contact(contacts.tangent.rate, len(mu))) > rest
-    return choose_with_friction(contacts, mu, before, held, released, slides, slack)
+    u = by_contact(contacts.tangent.rate, len(mu))
+    slides = length(u) > rest
+    return choose_with_friction(contacts, mu, old, held, released, slides, slack)
 
 
 def _largest_scales(
@@ -628,21 +670,28 @@ def _largest_scales(
     base, at least `sqrt(a closed_below)`; a, the largest of |f''| without contact
     forces, the sum of the sizes of its terms, and the speed over the duration.
     """
-    m = contacts.normal.rate.shape[0]
-    relative = state.v - carried_along(system, state.v, state.t)
-    total = kinetic(system, state.q, state.v)
-    energy = jnp.maximum(total, kinetic(system, state.q, relative))
-    speed = speed_of(energy, jnp.diagonal(contacts.delassus))
+    q = state.q
+    v = state.v
+    rate = contacts.normal.rate
+    m = len(rate)
+    relative = v - carried_along(system, v, state.t)
+    absolute = kinetic(system, q, v)
+    from_base = kinetic(system, q, relative)
+    energy = jnp.maximum(absolute, from_base)
+    w = jnp.diagonal(contacts.delassus)
+    speed = speed_of(energy, w)
     # the terms of an acceleration may cancel: what bodies side by side leave of it is
     # rounding, and so is what does not change the speed within the motion
     normals = jnp.abs(contacts.directions[:, :m])
     terms = normals.T @ jnp.abs(contacts.free)
     approach = jnp.abs(contacts.approach[:m])
     acceleration = jnp.maximum(approach, terms).max()
-    acceleration = jnp.maximum(acceleration, speed / settings.duration)
-    at_rest = jnp.sqrt(acceleration * settings.closed_below)
-    fastest = jnp.abs(contacts.normal.rate).max()
-    now = Scales(fastest, jnp.maximum(speed, at_rest), acceleration)
+    steady = speed / settings.duration
+    acceleration = jnp.maximum(acceleration, steady)
+    square = acceleration * settings.closed_below
+    speed = jnp.maximum(speed, jnp.sqrt(square))
+    fastest = jnp.abs(rate).max()
+    now = Scales(fastest, speed, acceleration)
     largest = jax.tree.map(jnp.maximum, scales, now)
     return jax.lax.stop_gradient(largest)
 
@@ -671,7 +720,7 @@ def _brought_to_rest(
     the contacts give the energy `p rates / 2`, as their mean velocity is half of that
     before.
     """
-    m = held.shape[0]
+    m = len(held)
     open_modes = no_modes(m, jump.v.dtype)
     modes = open_modes._replace(active=held, stick=stick)
     rates = contacts.normal.rate
@@ -685,24 +734,28 @@ def _brought_to_rest(
     work = 0.5 * p * rates
     tangential = jnp.zeros_like(jump.tangential)
     by_normal = work[:m]
-    energy = jnp.stack([by_normal, jnp.zeros_like(by_normal)])
+    no_friction = jnp.zeros_like(by_normal)
+    energy = jnp.stack([by_normal, no_friction])
     if contacts.tangent is not None:
         by_friction = by_contact(work[m:], m).sum(axis=1)
         energy = energy.at[1].set(by_friction)
         tangential = p[m:]
     # the gaps, up to `closed_below`, are closed by the flight that follows
-    lost = jnp.maximum(force[:m], 0.0) * contacts.normal.value
+    push = force[:m]
+    lost = jnp.maximum(push, 0.0) * contacts.normal.value
     fallen = jnp.where(held, lost, 0.0)
     carried = carried_along(system, jump.v, t)
-    jump = jump._replace(
+    impulse = contacts.directions @ p
+    given = jump.energy + energy
+    stopped = jump._replace(
         v=jump.v + contacts.moved @ p,
         impulse=jump.impulse + p[:m],
         tangential=jump.tangential + tangential,
-        energy=(jump.energy + energy).at[0].add(-fallen),
-        base_work=jump.base_work + (contacts.directions @ p) @ carried,
+        energy=given.at[0].add(-fallen),
+        base_work=jump.base_work + impulse @ carried,
     )
     energy_before = -jnp.sum(work)
-    return _Stop(jump, p, force[:m], energy_before)
+    return _Stop(stopped, p, push, energy_before)
 
 
 def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Passed:
@@ -717,19 +770,25 @@ def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Pas
     """
     p = stop.impulse[: len(ends)]
     energy = stop.energy
-    pressed = ends & (stop.force > 0)
+    has_force = stop.force > 0
+    pressed = ends & has_force
     force = jnp.where(pressed, stop.force, 1.0)
     some = jnp.any(pressed) & (energy > 0)
     # energy before the last impact
     earlier = energy + jnp.maximum(lost, 0)
-    before = jnp.where(some, earlier, 1.0)
+    divisor = jnp.where(some, earlier, 1.0)
     # 1/2 where nothing is passed: not used
-    r = jnp.sqrt(jnp.where(some, energy, 0.25) / before)
+    left = jnp.where(some, energy, 0.25)
+    r = jnp.sqrt(left / divisor)
     duration = 2 * jnp.abs(p) / force
-    hop = jnp.max(jnp.where(pressed, duration, 0.0))
-    lift = jnp.max(jnp.where(pressed, energy / force, 0.0))
-    count = jnp.sum(ends.astype(p.dtype))
-    return Passed(count * hop / (1 - r), lift)
+    height = energy / force
+    hops = jnp.where(pressed, duration, 0.0)
+    lifts = jnp.where(pressed, height, 0.0)
+    hop = jnp.max(hops)
+    lift = jnp.max(lifts)
+    k = jnp.sum(ends.astype(p.dtype))
+    time = k * hop / (1 - r)
+    return Passed(time, lift)
 
 
 def _kind(

@@ -79,8 +79,19 @@ _NEWTON_SCHULZ = 3
 def unit(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n ..."]:
     """The unit matrix, with an axis of length 1 for each batch axis of the matrix."""
     axes_of_batch = [1] * (matrix.ndim - 2)
-    identity = jnp.eye(len(matrix), dtype=matrix.dtype)
-    return identity.reshape(*matrix.shape[:2], *axes_of_batch)
+    n = len(matrix)
+    identity = jnp.eye(n, dtype=matrix.dtype)
+    return identity.reshape(n, n, *axes_of_batch)
+
+
+def unit_outside(
+    matrix: Float[Array, "n n"], held: Bool[Array, " n"]
+) -> Float[Array, "n n"]:
+    """The matrix in the rows and columns `held`, the unit matrix elsewhere."""
+    in_row = held[:, None]
+    in_column = held[None, :]
+    both = in_row & in_column
+    return jnp.where(both, matrix, unit(matrix))
 
 
 def times(
@@ -91,9 +102,10 @@ def times(
     """
     if matrix.ndim == 2:
         return matrix @ vector
-    if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
-        return jnp.sum(matrix * vector[None], axis=1)
     count = matrix.shape[1]
+    if count > COLUMNS_WRITTEN_OUT:
+        terms = matrix * vector[None]
+        return jnp.sum(terms, axis=1)
     columns = [matrix[:, j] * vector[j : j + 1] for j in range(count)]
     return functools.reduce(jnp.add, columns)
 
@@ -104,10 +116,11 @@ def product(
     """Products of matrices, `A B = sum_j A_j b_j`, of columns A_j of A and rows b_j of
     B.
     """
-    if a.shape[1] > COLUMNS_WRITTEN_OUT:
+    count = a.shape[1]
+    if count > COLUMNS_WRITTEN_OUT:
         terms = a[:, :, None] * b[None]
         return jnp.sum(terms, axis=1)
-    rank_one = [a[:, j, None] * b[j][None] for j in range(a.shape[1])]
+    rank_one = [a[:, j, None] * b[j][None] for j in range(count)]
     return functools.reduce(jnp.add, rank_one)
 
 
@@ -150,12 +163,15 @@ def _eliminated(
         0.
         """
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
-        row = row * inverted(jax.lax.dynamic_index_in_dim(row, k, 1))
+        pivot = jax.lax.dynamic_index_in_dim(row, k, 1)
+        row = row * inverted(pivot)
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
-        return jnp.where(number == k, row, rows - factor * row)
+        cleared = rows - factor * row
+        return jnp.where(number == k, row, cleared)
 
     both = jnp.concatenate([matrix, right], axis=1)
-    return fori_loop(0, n, eliminate, both)[:, n:]
+    last = fori_loop(0, n, eliminate, both)
+    return last[:, n:]
 
 
 def _solve_two(
@@ -168,15 +184,19 @@ def _solve_two(
     above = matrix[0, 1:] * scale
     x = right[0] * scale
     last_pivot = matrix[1, 1:] - factor * above
-    last = (right[1] - factor * x) * (1 / last_pivot)
-    return jnp.stack([x - above * last, last])
+    last_scale = 1 / last_pivot
+    rest = right[1] - factor * x
+    last = rest * last_scale
+    first = x - above * last
+    return jnp.stack([first, last])
 
 
 def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
     """A^-1 by Gauss-Jordan in place of A, without a choice of pivots as in `solve`."""
     n = len(matrix)
     if n <= 2:
-        return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
+        identity = jnp.broadcast_to(unit(matrix), matrix.shape)
+        return solve(matrix, identity)
     axes_of_batch = [1] * (matrix.ndim - 2)
     number = jnp.arange(n).reshape(n, 1, *axes_of_batch)
 
@@ -191,10 +211,12 @@ def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
         in_column = number[:, 0][None] == k
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
-        scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
+        pivot = jax.lax.dynamic_index_in_dim(row, k, 1)
+        scale = 1 / pivot
         row = jnp.where(in_column, scale, row * scale)
         others = jnp.where(in_column, 0.0, rows)
-        return jnp.where(in_row, row, others - column * row)
+        cleared = others - column * row
+        return jnp.where(in_row, row, cleared)
 
     return fori_loop(0, n, eliminate, matrix)
 
@@ -209,7 +231,8 @@ def solve_definite(
     if len(g) > _BY_LOOP:
         return jnp.linalg.solve(g, right)
     columns = right.reshape(len(g), -1, 1)
-    return solve(g[..., None], columns).reshape(right.shape)
+    solution = solve(g[..., None], columns)
+    return solution.reshape(right.shape)
 
 
 @jax.jit
@@ -223,13 +246,18 @@ def solve_mass_matrix(
     """
     if mass.ndim == 1:
         axes_of_columns = [1] * (right.ndim - 1)
-        return right / mass.reshape(-1, *axes_of_columns)
+        diagonal = mass.reshape(-1, *axes_of_columns)
+        return right / diagonal
     if len(mass) > _BY_LOOP:
         return jax.scipy.linalg.solve(mass, right, assume_a="pos")
     columns = right.reshape(len(mass), -1, 1)
-    solved = _eliminated(
-        mass[..., None], columns, lambda p: 1 / jnp.where(p > 0, p, jnp.nan)
-    )
+
+    def inverted(pivot: jax.Array) -> jax.Array:
+        """1 / pivot, NaN where it is not positive."""
+        positive = pivot > 0
+        return 1 / jnp.where(positive, pivot, jnp.nan)
+
+    solved = _eliminated(mass[..., None], columns, inverted)
     return solved.reshape(right.shape)
 
 
@@ -240,9 +268,9 @@ def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"
     A singular block is perturbed by eps^(2/3), which refinements by the caller undo.
     More would perturb regular blocks, too, in single precision.
     """
-    perturbation = precision(matrix.dtype).eps ** (2 / 3)
-    m = len(matrix)
-    b = matrix.shape[1]
+    eps = precision(matrix.dtype).eps
+    perturbation = eps ** (2 / 3)
+    m, b, *_ = matrix.shape
     eye = jnp.eye(b, dtype=matrix.dtype)[..., None]
 
     def eliminate(
@@ -251,7 +279,8 @@ def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"
         """Matrices after Gauss-Jordan elimination in place, with diagonal block i as
         pivot.
         """
-        pivot = (jnp.arange(m) == i)[:, None, None, None]
+        is_pivot = jnp.arange(m) == i
+        pivot = is_pivot[:, None, None, None]
         # (m, b, b, N) and (b, m, b, N) of blocks
         column = inverse[:, :, i]
         row = inverse[i]
@@ -262,11 +291,14 @@ def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"
         terms = block[:, :, None, None] * row[None]
         row = jnp.sum(terms, axis=1)  # block times row
         # row i and column i of blocks
-        replaced = pivot[..., None] | pivot[None, None, :, 0]
+        in_row = pivot[..., None]
+        in_column = pivot[None, None, :, 0]
+        replaced = in_row | in_column
         # column times row
         terms = column[:, :, :, None, None] * row[None, None]
         spread = jnp.sum(terms, axis=2)
-        return jnp.where(replaced, 0.0, inverse) - spread
+        others = jnp.where(replaced, 0.0, inverse)
+        return others - spread
 
     return fori_loop(0, m, eliminate, matrix)
 
@@ -278,13 +310,16 @@ def block_solve(
 
     Of more than `_BLOCKS` rows by LAPACK.
     """
-    m, b = matrix.shape[:2]
-    if m * b > _BLOCKS:
-        square = matrix.reshape(m * b, m * b)
-        flat = square, right.reshape(m * b, -1)
-        return jnp.linalg.solve(*flat).reshape(right.shape)
-    perturbation = precision(matrix.dtype).eps ** 2  # of a block that is singular
-    flat_rows = matrix.reshape(m, b, m * b)
+    m, b, *_ = matrix.shape
+    n = m * b
+    if n > _BLOCKS:
+        square = matrix.reshape(n, n)
+        columns = right.reshape(n, -1)
+        solution = jnp.linalg.solve(square, columns)
+        return solution.reshape(right.shape)
+    eps = precision(matrix.dtype).eps
+    perturbation = eps**2  # of a block that is singular
+    flat_rows = matrix.reshape(m, b, n)
     rows = jnp.concatenate([flat_rows, right], axis=2)
 
     def eliminate(
@@ -292,13 +327,16 @@ def block_solve(
     ) -> Float[Array, "m b w"]:
         """Rows of [A, right] after elimination with the diagonal block i as pivot."""
         row = jax.lax.dynamic_index_in_dim(rows, i, 0, keepdims=False)
-        block = jax.lax.dynamic_slice_in_dim(row, i * b, b, axis=1)
-        row = _small_inverse(block[..., None], perturbation)[..., 0] @ row
-        column = jax.lax.dynamic_slice_in_dim(rows, i * b, b, axis=2)
+        first = i * b
+        block = jax.lax.dynamic_slice_in_dim(row, first, b, axis=1)
+        inverse = _small_inverse(block[..., None], perturbation)
+        row = inverse[..., 0] @ row
+        column = jax.lax.dynamic_slice_in_dim(rows, first, b, axis=2)
         rows = rows - jnp.einsum("jab,bk->jak", column, row)
         return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
 
-    return fori_loop(0, m, eliminate, rows)[..., m * b :]
+    last = fori_loop(0, m, eliminate, rows)
+    return last[..., n:]
 
 
 def _small_inverse(
@@ -307,20 +345,24 @@ def _small_inverse(
     """Inverses `adj(A) / det(A)` of blocks, b = 2 or 3, perturbed where they are
     singular.
     """
-    singular = jnp.abs(_small_determinant(block)) < perturbation
+    size = jnp.abs(_small_determinant(block))
+    singular = size < perturbation
     b = len(block)
     eye = jnp.eye(b, dtype=block.dtype)[..., None]
     shift = jnp.where(singular, perturbation, 0.0)
     block = block + shift[None, None] * eye
     determinant = _small_determinant(block)
-    divisor = jnp.where(determinant == 0, 1.0, determinant)
-    return _cofactors(block) / divisor[None, None]
+    is_zero = determinant == 0
+    divisor = jnp.where(is_zero, 1.0, determinant)
+    adjugate = _cofactors(block)
+    return adjugate / divisor[None, None]
 
 
 def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, " N"]:
     """Determinants of blocks, b = 2 or 3: the first row times its cofactors."""
     cofactors = _cofactors(a)[:, 0]
-    return jnp.sum(a[0] * cofactors, axis=0)
+    products = a[0] * cofactors
+    return jnp.sum(products, axis=0)
 
 
 def _cofactors(a: Float[Array, "b b N"]) -> Float[Array, "b b N"]:
@@ -356,22 +398,28 @@ def solve_by_pivots(
         """
         rows, determinant = state
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
-        size = jnp.where(number >= k, jnp.abs(column), -1.0)
+        below = number >= k
+        size = jnp.where(below, jnp.abs(column), -1.0)
         largest = jnp.argmax(size, axis=0)[0]
         # the rows k and `largest` change places
         row_of = functools.partial(jax.lax.dynamic_index_in_dim, rows, axis=0)
-        own, chosen = (row_of(i) for i in (k, largest))
+        row_k = row_of(k)
+        chosen = row_of(largest)
         pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
-        rows = jnp.where(number == largest, own, rows)
+        rows = jnp.where(number == largest, row_k, rows)
         row = chosen / pivot
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
-        signed = jnp.where(largest == k, pivot, -pivot)[0, 0]
+        stays = largest == k
+        signed = jnp.where(stays, pivot, -pivot)[0, 0]
         # NaN after 0
-        determinant = jnp.where(determinant == 0, 0.0, determinant * signed)
-        return jnp.where(number == k, row, rows - factor * row), determinant
+        singular = determinant == 0
+        determinant = jnp.where(singular, 0.0, determinant * signed)
+        cleared = rows - factor * row
+        return jnp.where(number == k, row, cleared), determinant
 
     one = jnp.ones((), matrix.dtype)
-    start = jnp.concatenate([matrix, right], axis=1), one
+    both = jnp.concatenate([matrix, right], axis=1)
+    start = both, one
     rows, determinant = fori_loop(0, n, eliminate, start)
     return rows[:, n:], determinant
 
@@ -382,9 +430,16 @@ def determinants(k: Float[Array, "N n n"]) -> Float[Array, " N"]:
     Those of four rows are sums of products of minors of two rows (Laplace), quicker to
     compile.
     """
-    if k.shape[-1] != 4:
-        none = jnp.zeros((k.shape[-1], 0), k.dtype)
-        return jax.vmap(lambda matrix: solve_by_pivots(matrix, none)[1])(k)
+    n = k.shape[-1]
+    if n != 4:
+        none = jnp.zeros((n, 0), k.dtype)
+
+        def determinant(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+            """Determinant of one matrix, by pivots."""
+            _, value = solve_by_pivots(matrix, none)
+            return value
+
+        return jax.vmap(determinant)(k)
     left, right = np.triu_indices(4, 1)
     # entries of each row in both columns of a minor
     a = k[..., left]
@@ -395,7 +450,8 @@ def determinants(k: Float[Array, "N n n"]) -> Float[Array, " N"]:
     odd = (left + right) % 2
     signs = jnp.asarray(np.where(odd, 1, -1), k.dtype)
     opposite = minors[:, 1, ::-1]
-    return jnp.sum(minors[:, 0] * opposite * signs[None], axis=-1)
+    terms = minors[:, 0] * opposite * signs[None]
+    return jnp.sum(terms, axis=-1)
 
 
 # ---- singular matrices: redundant contacts
@@ -409,9 +465,10 @@ def load_shares(
 
     None is below `least`, which keeps the weights of contacts without load regular.
     """
-    most = jnp.max(limit, axis=0, keepdims=True)
-    largest = jax.lax.stop_gradient(most)
-    share = limit / jnp.where(largest > 0, largest, 1.0)
+    largest = jnp.max(limit, axis=0, keepdims=True)
+    largest = jax.lax.stop_gradient(largest)
+    some = largest > 0
+    share = limit / jnp.where(some, largest, 1.0)
     if least > 0:
         return jnp.maximum(share, least)
     return share
@@ -435,27 +492,30 @@ def regularized(
 
     The barriers keep XLA from computing what is multiplied once more for each column.
     """
-    kept = jax.lax.optimization_barrier  # computed once, see above
+    once = jax.lax.optimization_barrier  # computed once, see above
     # apart: only the right side is linear in tangents
-    matrix = kept(matrix)
-    right = kept(right)
+    matrix = once(matrix)
+    right = once(right)
     if matrix.ndim == 2:
         on_diagonal = ridge
     else:
         on_diagonal = ridge[:, None]
-    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * on_diagonal))
+    with_ridge = matrix + unit(matrix) * on_diagonal
+    inverted = jax.lax.stop_gradient(inverse(with_ridge))
 
     def solved(right: Float[Array, "n *#B"]) -> Float[Array, "n *#B"]:
         """`z = (A + ridge)^-1 right`, `without_null` less `(A + ridge)^-1 ridge z`."""
         z = times(inverted, right)
         if without_null:
-            return z - times(inverted, ridge * z)
+            of_null = times(inverted, ridge * z)
+            return z - of_null
         return z
 
     z = solved(right)
     for _ in range(refinements):
-        z = kept(z)
-        z = z + solved(kept(right - times(matrix, z)))
+        z = once(z)
+        rest = right - times(matrix, z)
+        z = z + solved(once(rest))
     return z
 
 
@@ -480,7 +540,8 @@ def _regularized_tangent(
     matrix, ridge, right = primals
     dmatrix, _, dright = tangents
     z = regularized_once(matrix, ridge, right)
-    return z, regularized_once(matrix, ridge, dright - times(dmatrix, z))
+    rest = dright - times(dmatrix, z)
+    return z, regularized_once(matrix, ridge, rest)
 
 
 def pseudoinverse(
@@ -493,18 +554,22 @@ def pseudoinverse(
     removes from what K transmits, to rounding; in the null space of K, forces are the
     least ones to some percent.
     """
-    both = held[:, None] & held[None]
+    rows = held[:, None]
+    both = rows & held[None]
     k = jnp.where(both, matrix, 0.0)
     entries = jnp.abs(k)
     size = jnp.max(entries, axis=(0, 1), keepdims=True)
     eps = float(jnp.finfo(k.dtype).eps)
-    positive = jnp.where(size > 0, size, 1.0)
+    some = size > 0
+    positive = jnp.where(some, size, 1.0)
     part = _NEGLIGIBLE_PART * math.sqrt(eps) * positive
-    ridge = jnp.where(held[:, None], part, 1.0)
+    ridge = jnp.where(rows, part, 1.0)
     damped = inverse(k + unit(k) * ridge)
-    z = product(damped, product(k, damped))
+    of_k = product(k, damped)
+    z = product(damped, of_k)
     for _ in range(_NEWTON_SCHULZ):
-        z = 2 * z - product(z, product(k, z))
+        k_z = product(k, z)
+        z = 2 * z - product(z, k_z)
     return z
 
 
@@ -534,7 +599,8 @@ def _are_null(values: Float[Array, "n *N"]) -> Bool[Array, "n *N"]:
 def singular_values(matrix: Float[Array, "n n"]) -> SingularValues:
     """Singular value decomposition of one matrix, without derivatives."""
     left, values, right = jnp.linalg.svd(matrix)
-    return SingularValues(left, values, right, _are_null(values))
+    null = _are_null(values)
+    return SingularValues(left, values, right, null)
 
 
 @singular_values.def_vmap
@@ -549,17 +615,23 @@ def _batch_of_singular_values(
     all_batched = SingularValues(left=yes, values=yes, right=yes, null=yes)
     if matrices.shape[-1] > _BY_LOOP:
         left, values, right = jnp.linalg.svd(matrices)
-        return SingularValues(left, values, right, _are_null(values.T).T), all_batched
+        null = _are_null(values.T)
+        found = SingularValues(left, values, right, null.T)
+        return found, all_batched
     matrix = jnp.moveaxis(matrices, 0, -1)
     images, right, values = _orthogonal(matrix)
     null = _are_null(values)
-    left = images / jnp.where(null, 1.0, values)[None]
-    left = cond(
-        jnp.any(null),
-        lambda: jnp.where(null[None], _orthogonal(matrix.swapaxes(0, 1))[1], left),
-        lambda: left,
-    )
-    parts = left, values, right.swapaxes(0, 1), null
+    divisor = jnp.where(null, 1.0, values)
+    left = images / divisor[None]
+
+    def with_null() -> Float[Array, "n n N"]:
+        """U whose columns of values 0 come from the rotations of A^T."""
+        _, of_transposed, _ = _orthogonal(matrix.swapaxes(0, 1))
+        return jnp.where(null[None], of_transposed, left)
+
+    left = cond(jnp.any(null), with_null, lambda: left)
+    rows = right.swapaxes(0, 1)
+    parts = left, values, rows, null
     in_front = (jnp.moveaxis(x, -1, 0) for x in parts)
     return SingularValues(*in_front), all_batched
 
@@ -585,7 +657,8 @@ def _batch_of_eigenvectors(
     if matrices.shape[-1] > _BY_LOOP:
         values, vectors = jnp.linalg.eigh(matrices)
         return (values, vectors), (True, True)
-    _, vectors, values = _orthogonal(jnp.moveaxis(matrices, 0, -1))
+    matrix = jnp.moveaxis(matrices, 0, -1)
+    _, vectors, values = _orthogonal(matrix)
     in_front = jnp.moveaxis(vectors, -1, 0)
     return (values.T, in_front), (True, True)
 
@@ -609,75 +682,101 @@ def _orthogonal(
     both = jnp.concatenate([matrix, identity])
     missing = (0, places - n)
     both = jnp.pad(both, ((0, 0), missing, (0, 0)))
-
-    class Sweep(NamedTuple):
-        """Columns of [A V; V] in two rows, the largest cos^2 between two of A V, sweeps
-        done.
-        """
-
-        first: Float[Array, "entries pairs B"]
-        second: Float[Array, "entries pairs B"]
-        cosine: Float[Array, ""]
-        done: Int[Array, ""]
-
-    def rotate(_: Any, at: Sweep) -> Sweep:
-        """State after one round: columns x, y of a pair are turned until x . y = 0, and
-        move on.
-
-        The slope t of the angle is the small root of
-        `t^2 + (|y|^2 - |x|^2) / (x . y) t = 1`.
-        """
-        x, y, largest, done = at
-        terms = x[:n] * y[:n]
-        product = jnp.sum(terms, axis=0, keepdims=True)
-        squares = [
-            jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)
-        ]
-        half = (squares[1] - squares[0]) / 2
-        real = jnp.minimum(*squares) > (rounding**2) * whole  # other columns are 0
-        of_both = squares[0] * squares[1]
-        angle = quotient(product**2, of_both, where=real)
-        root = jnp.sqrt(half**2 + product**2)
-        longer = jnp.where(half >= 0, half + root, half - root)
-        slope = product / jnp.where(longer != 0, longer, 1.0)
-        cosine = 1 / jnp.sqrt(1 + slope**2)
-        sine = slope * cosine
-        x, y = cosine * x - sine * y, sine * x + cosine * y
-        largest = jnp.maximum(largest, jnp.max(angle))
-        if places == 2:
-            return Sweep(x, y, largest, done)
-        x, y = _moved_on(x, y)
-        return Sweep(x, y, largest, done)
-
-    def sweep(at: Sweep) -> Sweep:
-        """State after a sweep: as many rounds as make each column meet each other
-        one.
-        """
-        start = at._replace(cosine=jnp.zeros_like(at.cosine))
-        end = fori_loop(0, places - 1, rotate, start)
-        return end._replace(done=at.done + 1)
-
     rounding = n * precision(matrix.dtype).eps
     entries_squared = matrix**2
     whole = jnp.sum(entries_squared, axis=(0, 1), keepdims=True)
+
+    def rotate(_: Any, state: _Sweep) -> _Sweep:
+        """State after one round: the columns of each pair are turned, and move on."""
+        x, y, largest, done = state
+        x, y, cosine = _turned(x, y, n, rounding**2 * whole)
+        largest = jnp.maximum(largest, jnp.max(cosine))
+        if places > 2:
+            x, y = _moved_on(x, y)
+        return _Sweep(x, y, largest, done)
+
+    def sweep(state: _Sweep) -> _Sweep:
+        """State after a sweep: as many rounds as make each column meet each other
+        one.
+        """
+        none = jnp.zeros_like(state.cosine)
+        start = state._replace(cosine=none)
+        end = fori_loop(0, places - 1, rotate, start)
+        return end._replace(done=state.done + 1)
+
+    def goes_on(state: _Sweep) -> Bool[Array, ""]:
+        """True until all columns are orthogonal but for rounding."""
+        oblique = state.cosine > rounding**2
+        some_left = state.done < _JACOBI_SWEEPS
+        return oblique & some_left
+
     first, second = jnp.split(both, 2, axis=1)
     one = jnp.ones((), matrix.dtype)
-    start = Sweep(first, second, one, jnp.int32(0))
-    end = while_loop(
-        lambda at: (at.cosine > rounding**2) & (at.done < _JACOBI_SWEEPS), sweep, start
-    )
+    start = _Sweep(first, second, one, jnp.int32(0))
+    end = while_loop(goes_on, sweep, start)
     with_padding = jnp.concatenate([end.first, end.second], axis=1)
     both = with_padding[:, :n]
-    return _by_falling_length(both[:n], both[n:])
+    images = both[:n]
+    vectors = both[n:]
+    return _by_falling_length(images, vectors)
+
+
+class _Sweep(NamedTuple):
+    """Columns of [A V; V] in two rows, the largest cos^2 between two of A V, sweeps
+    done.
+    """
+
+    first: Float[Array, "entries pairs B"]
+    second: Float[Array, "entries pairs B"]
+    cosine: Float[Array, ""]
+    done: Int[Array, ""]
+
+
+def _turned(
+    x: Float[Array, "entries pairs B"],
+    y: Float[Array, "entries pairs B"],
+    n: int,
+    negligible: Float[Array, "1 1 B"],
+) -> tuple[
+    Float[Array, "entries pairs B"],
+    Float[Array, "entries pairs B"],
+    Float[Array, "1 pairs B"],
+]:
+    """Columns x, y of each pair turned until x . y = 0 over their first n entries, and
+    cos^2 of the angle that they had.
+
+    The slope t of the turn is the small root of
+    `t^2 + (|y|^2 - |x|^2) / (x . y) t = 1`. The angle of columns whose squares are
+    `negligible` counts as right.
+    """
+    product = jnp.sum(x[:n] * y[:n], axis=0, keepdims=True)
+    square_x = jnp.sum(x[:n] ** 2, axis=0, keepdims=True)
+    square_y = jnp.sum(y[:n] ** 2, axis=0, keepdims=True)
+    half = (square_y - square_x) / 2
+    real = jnp.minimum(square_x, square_y) > negligible  # other columns are 0
+    of_both = square_x * square_y
+    square_of_cosine = quotient(product**2, of_both, where=real)
+    root = jnp.sqrt(half**2 + product**2)
+    positive = half >= 0
+    longer = jnp.where(positive, half + root, half - root)
+    some = longer != 0
+    slope = product / jnp.where(some, longer, 1.0)
+    cosine = 1 / jnp.sqrt(1 + slope**2)
+    sine = slope * cosine
+    turned_x = cosine * x - sine * y
+    turned_y = sine * x + cosine * y
+    return turned_x, turned_y, square_of_cosine
 
 
 def _moved_on(
     x: Float[Array, "entries pairs B"], y: Float[Array, "entries pairs B"]
 ) -> tuple[Float[Array, "entries pairs B"], Float[Array, "entries pairs B"]]:
     """Two rows of columns whose columns but the first move on by one place, round."""
-    kept_places = x[:, 1:-1]
-    first = jnp.concatenate([x[:, :1], y[:, :1], kept_places], axis=1)
-    second = jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1)
+    first_x = x[:, :1]
+    last_x = x[:, -1:]
+    first_y = y[:, :1]
+    first = jnp.concatenate([first_x, first_y, x[:, 1:-1]], axis=1)
+    second = jnp.concatenate([y[:, 1:], last_x], axis=1)
     return first, second
 
 
@@ -685,10 +784,12 @@ def _by_falling_length(
     images: Float[Array, "n n B"], vectors: Float[Array, "n n B"]
 ) -> tuple[Float[Array, "n n B"], Float[Array, "n n B"], Float[Array, "n B"]]:
     """Columns of A V and of V in the order of the falling lengths of A V, and these."""
-    length = jnp.sqrt(jnp.sum(images**2, axis=0))
+    squares = jnp.sum(images**2, axis=0)
+    length = jnp.sqrt(squares)
     order = jnp.argsort(-length, axis=0)
-    ordered_images = jnp.take_along_axis(images, order[None], axis=1)
-    ordered_vectors = jnp.take_along_axis(vectors, order[None], axis=1)
+    columns = order[None]
+    ordered_images = jnp.take_along_axis(images, columns, axis=1)
+    ordered_vectors = jnp.take_along_axis(vectors, columns, axis=1)
     falling = jnp.take_along_axis(length, order, axis=0)
     return ordered_images, ordered_vectors, falling
 
@@ -702,9 +803,11 @@ def null_projector(
     Held constant in derivatives: a perturbation is taken to keep the rank.
     """
     values, vectors = eigenvectors(jax.lax.stop_gradient(g))
-    null = values < precision(g.dtype).singular * len(g)
+    rounding = precision(g.dtype).singular * len(g)
+    null = values < rounding
     basis = jnp.where(null[None, :], vectors, 0.0)
-    return basis @ basis.T, jnp.any(null)
+    projector = basis @ basis.T
+    return projector, jnp.any(null)
 
 
 def solve_symmetric(
@@ -723,5 +826,6 @@ def solve_symmetric(
     x = solve_definite(g + projector, right)
     residual = jnp.abs(g @ x - right).max()
     largest = jnp.abs(right).max()
-    missed = residual > precision(g.dtype).root * largest
+    allowed = precision(g.dtype).root * largest
+    missed = residual > allowed
     return x, singular, singular & missed

@@ -13,7 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.numerics.dense import null_projector, solve_by_pivots, solve_definite
+from jimpact.numerics.dense import (
+    null_projector,
+    solve_by_pivots,
+    solve_definite,
+    unit_outside,
+)
 from jimpact.numerics.many_contacts import solve_many
 from jimpact.numerics.sparse import Sparse, conjugate_gradients
 from jimpact.numerics.tridiagonal import Symmetric, as_matrix, is_regular
@@ -174,13 +179,13 @@ def _solve_on(
     symmetric: bool = True,
 ) -> Float[Array, " m"]:
     """z with `A_SS z_S = right_S` on the support S, z = 0 elsewhere."""
-    both = support[:, None] & support[None, :]
-    identity = jnp.eye(a.shape[0], dtype=a.dtype)
-    masked = jnp.where(both, a, identity)
+    masked = unit_outside(a, support)
     right = jnp.where(support, right, 0.0)
     if symmetric:
         return solve_definite(masked, right)
-    return solve_by_pivots(masked, right[:, None])[0][:, 0]
+    column = right[:, None]
+    z, _ = solve_by_pivots(masked, column)
+    return z[:, 0]
 
 
 def _least_norm(
@@ -192,15 +197,12 @@ def _least_norm(
     With P the projector on the null space of A where w = 0, they are `r + P y >= 0`, r
     = z - P z; the least has `y >= 0`, complementary to r + P y: one more such problem.
     """
-    m = b.shape[0]
     w = jax.lax.stop_gradient(a @ z + b)
-    tight = w <= gathered_rounding(len(b), b.dtype)
-    both = tight[:, None] & tight[None, :]
-    identity = jnp.eye(m, dtype=b.dtype)
-    projector, singular = null_projector(jnp.where(both, a, identity))
+    rounding = gathered_rounding(len(b), b.dtype)
+    tight = w <= rounding
+    projector, singular = null_projector(unit_outside(a, tight))
     rest = z - projector @ z
     # rounding of `rest` at zero must not start pivots
-    rounding = gathered_rounding(len(b), b.dtype)
     noise = jnp.abs(rest) <= rounding * jnp.abs(z).max()
     constant = jax.lax.stop_gradient(rest)
     support, _ = _support(projector, jnp.where(noise, 0.0, constant))

@@ -33,7 +33,8 @@ class CappedPolyhedron(NamedTuple):
 
         0 or less inside the set.
         """
-        beyond_ball = np.linalg.norm(w, axis=-1) - self.radius
+        length = np.linalg.norm(w, axis=-1)
+        beyond_ball = length - self.radius
         missing = self.offset - w @ self.rows.T
         beyond_rows = missing.max(axis=-1, initial=-np.inf)
         return np.maximum(beyond_ball, beyond_rows)
@@ -46,13 +47,17 @@ class CappedPolyhedron(NamedTuple):
         solution of `[rows, need]^T x = (0, ..., 0, 1)`, `need = offset - rows point`.
         """
         need = self.offset - self.rows @ point
-        if not (need > 0).any():
+        largest = need.max(initial=0.0)
+        if not largest > 0:
             return point
-        target = np.zeros(self.rows.shape[1] + 1)
+        dimension = self.rows.shape[1]
+        target = np.zeros(dimension + 1)
         target[-1] = 1.0
-        matrix = np.vstack([self.rows.T, need / need.max()])
-        active = least_squares(matrix, target) > 0
-        step = np.linalg.lstsq(self.rows[active], need[active], rcond=None)[0]
+        matrix = np.vstack([self.rows.T, need / largest])
+        x = least_squares(matrix, target)
+        active = x > 0
+        rows = self.rows[active]
+        step, *_ = np.linalg.lstsq(rows, need[active], rcond=None)
         return point + step
 
     def lowest(self, direction: np.ndarray) -> np.ndarray:
@@ -66,7 +71,8 @@ class CappedPolyhedron(NamedTuple):
 
         length = np.linalg.norm(direction)
         if length == 0 or self.radius == 0:
-            return self.project(np.zeros_like(direction))
+            origin = np.zeros_like(direction)
+            return self.project(origin)
         c = direction / length
 
         # minimizes c.w + |w|^2 / (2 s); |w| grows with s until the ball or a least c.w
@@ -74,22 +80,26 @@ class CappedPolyhedron(NamedTuple):
         def beyond(s: float) -> float:
             """Distance of the minimizer of this s from the ball; negative inside."""
             minimizer = self.project(-s * c)
-            return float(np.linalg.norm(minimizer) - self.radius)
+            length = np.linalg.norm(minimizer)
+            return float(length - self.radius)
 
         far = self.radius
         while beyond(far) < 0:
             w = self.project(-far * c)
             slack = self.rows @ w - self.offset
-            touching = self.rows[slack <= _ROUNDING * self.radius]
+            holds = slack <= _ROUNDING * self.radius
+            touching = self.rows[holds]
             # c in the cone of the rows that hold with equality: c.w is least here
             # without the ball
-            in_cone = touching.T @ least_squares(touching.T, c)
-            is_in_cone = np.linalg.norm(in_cone - c) <= _ROUNDING
-            if is_in_cone or far > _FARTHEST * self.radius:
+            multipliers = least_squares(touching.T, c)
+            off = touching.T @ multipliers - c
+            in_cone = np.linalg.norm(off) <= _ROUNDING
+            if in_cone or far > _FARTHEST * self.radius:
                 return w
             far *= 4
         if beyond(0.0) >= 0:
-            return self.project(np.zeros_like(c))
+            origin = np.zeros_like(c)
+            return self.project(origin)
         precision = 4 * np.finfo(float).eps
         s = brentq(beyond, 0.0, far, xtol=1e-300, rtol=precision)
         return self.project(-s * c)
@@ -104,19 +114,22 @@ class CappedPolyhedron(NamedTuple):
         from scipy.optimize import linprog  # late: slow to import
 
         dimension = self.rows.shape[1]
-        within_ball = [(-self.radius, self.radius)] * dimension
-        box = [*within_ball, (0.0, self.radius)]
+        r = self.radius
+        within_ball = [(-r, r)] * dimension
+        box = [*within_ball, (0.0, r)]
         distances = np.ones((len(self.rows), 1))
         slack = np.hstack([-self.rows, distances])
-        cost = np.append(np.zeros(dimension), -1.0)  # linprog minimizes -t
+        origin = np.zeros(dimension)
+        cost = np.append(origin, -1.0)  # linprog minimizes -t
         optimum = linprog(cost, slack, -self.offset, bounds=box)
         deep = optimum.x[:-1]
-        least = self.project(np.zeros(dimension))
+        least = self.project(origin)
         step = deep - least
         if not step.any():
             return least
-        _, leaves = _chord(least[None], step[None], self.radius)
-        return least + 0.5 * min(1.0, leaves[0]) * step
+        _, leaves = _chord(least[None], step[None], r)
+        share = min(1.0, leaves[0])
+        return least + 0.5 * share * step
 
     def sample(self, generator: np.random.Generator, count: int) -> np.ndarray:
         """`count` points (count, d), uniform: each the end of its own hit-and-run
@@ -130,16 +143,20 @@ class CappedPolyhedron(NamedTuple):
             step /= np.linalg.norm(step, axis=1, keepdims=True)
             # along w = point + t step the slack of row i, slack_i + t rate_i, is 0 at t
             # = reach_i
-            slack = np.maximum(points @ self.rows.T - self.offset, 0.0)
+            slack = points @ self.rows.T - self.offset
+            slack = np.maximum(slack, 0.0)
             rate = step @ self.rows.T
             with np.errstate(divide="ignore", invalid="ignore"):
                 reach = -slack / rate
             low, high = _chord(points, step, self.radius)
             falls = np.where(rate < 0, reach, np.inf)
-            high = np.minimum(high, falls.min(1, initial=np.inf))
+            first_end = falls.min(1, initial=np.inf)
+            high = np.minimum(high, first_end)
             rises = np.where(rate > 0, reach, -np.inf)
-            low = np.maximum(low, rises.max(1, initial=-np.inf))
-            position = low + (high - low) * generator.random(count)
+            last_begin = rises.max(1, initial=-np.inf)
+            low = np.maximum(low, last_begin)
+            share = generator.random(count)
+            position = low + (high - low) * share
             points = points + position[:, None] * step
         return points
 
@@ -152,34 +169,40 @@ class CappedPolyhedron(NamedTuple):
         """
         x, y = self.rows.T
         angle = np.arctan2(y, x)
-        cut = np.abs(self.offset) <= self.radius
-        half = np.arccos(self.offset[cut] / self.radius)
-        both = np.concatenate([angle[cut] - half, angle[cut] + half])
-        ends = np.sort(both % (2 * np.pi))
+        r = self.radius
+        circle = 2 * np.pi
+        cut = np.abs(self.offset) <= r
+        half = np.arccos(self.offset[cut] / r)
+        middle = angle[cut]
+        both = np.concatenate([middle - half, middle + half])
+        ends = np.sort(both % circle)
         if len(ends) == 0:
             first_point = self.on_circle(np.zeros(1))
-            inside = self.excess(first_point)[0] <= _ROUNDING * self.radius
-            if inside:
-                return (0.0, 2 * np.pi)
+            excess = self.excess(first_point)
+            if excess[0] <= _ROUNDING * r:
+                return 0.0, circle
             return None
         # pieces of the circle between neighbouring ends; feasible: its midpoint is in
         # the set
-        once_around = ends[0] + 2 * np.pi
+        once_around = ends[0] + circle
         width = np.diff(np.append(ends, once_around))
         middles = self.on_circle(ends + 0.5 * width)
-        feasible = self.excess(middles) <= _ROUNDING * self.radius
+        feasible = self.excess(middles) <= _ROUNDING * r
         if feasible.all():
-            return 0.0, 2 * np.pi
+            return 0.0, circle
         # the feasible pieces that follow one that is not: from `first` to the next that
         # is not
-        before = np.roll(feasible, 1)
-        first = int(np.argmax(feasible & ~before))
+        previous = np.roll(feasible, 1)
+        begins = feasible & ~previous
+        first = int(np.argmax(begins))
         run = np.roll(feasible, -first)
         widths = np.roll(width, -first)
-        length = widths[: np.argmin(run)].sum()
-        if run[0]:
-            return (float(ends[first]), float(ends[first] + length))
-        return None
+        if not run[0]:
+            return None
+        pieces = np.argmin(run)
+        begin = ends[first]
+        end = begin + widths[:pieces].sum()
+        return float(begin), float(end)
 
     def boundary(self, arc_points: int) -> np.ndarray:
         """Points (k, 2) of the boundary, counter-clockwise, with its corners; d = 2
@@ -188,18 +211,23 @@ class CappedPolyhedron(NamedTuple):
         corners = [np.zeros((0, 2))]
         # where two rows hold with equality
         for i, j in combinations(range(len(self.rows)), 2):
-            pair = self.rows[[i, j]]
-            if abs(np.linalg.det(pair)) > _INDEPENDENT:
-                corner = np.linalg.solve(pair, self.offset[[i, j]])
+            rows = [i, j]
+            pair = self.rows[rows]
+            determinant = np.linalg.det(pair)
+            if abs(determinant) > _INDEPENDENT:
+                corner = np.linalg.solve(pair, self.offset[rows])
                 corners.append(corner[None])
         arc = self.arc()
         if arc is not None:
-            corners.append(self.on_circle(np.linspace(*arc, arc_points)))
+            angles = np.linspace(*arc, arc_points)
+            corners.append(self.on_circle(angles))
         points = np.concatenate(corners)
-        points = points[self.excess(points) <= _ROUNDING * self.radius]
+        inside = self.excess(points) <= _ROUNDING * self.radius
+        points = points[inside]
         relative = points - self.interior()
         x, y = relative.T
-        return points[np.argsort(np.arctan2(y, x))]
+        angle = np.arctan2(y, x)
+        return points[np.argsort(angle)]
 
     def on_circle(self, angle: np.ndarray) -> np.ndarray:
         """Points (..., 2) of the circle at angles [rad]."""
@@ -225,16 +253,21 @@ def capped_polyhedron(
     if may_be_flat:
         optima = (linprog(-row, -rows, -offset, bounds=box) for row in rows)
         highest = [-optimum.fun for optimum in optima]
-        flat = np.array(highest) - offset <= _FLAT * radius
-    _, singular, basis = np.linalg.svd(rows[flat])
-    rank = int((singular > _INDEPENDENT).sum())
+        slack = np.array(highest) - offset
+        flat = slack <= _FLAT * radius
+    equalities = rows[flat]
+    _, singular, basis = np.linalg.svd(equalities)
+    regular = singular > _INDEPENDENT
+    rank = int(regular.sum())
     axes = basis[rank:].T  # null space of the equalities
-    centre, *_ = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)
-    distance_squared = float(centre @ centre)
-    inner = float(np.sqrt(max(radius**2 - distance_squared, 0.0)))
-    offset_of_u = offset[~flat] - rows[~flat] @ centre
-    within = _unit_rows(rows[~flat] @ axes, offset_of_u, _INDEPENDENT)
-    return CappedPolyhedron(*within, inner), centre, axes
+    centre, *_ = np.linalg.lstsq(equalities, offset[flat], rcond=_INDEPENDENT)
+    square = radius**2 - float(centre @ centre)
+    inner = float(np.sqrt(max(square, 0.0)))
+    bounds = rows[~flat]
+    offset_of_u = offset[~flat] - bounds @ centre
+    within = _unit_rows(bounds @ axes, offset_of_u, _INDEPENDENT)
+    polyhedron = CappedPolyhedron(*within, inner)
+    return polyhedron, centre, axes
 
 
 def _unit_rows(
@@ -242,9 +275,10 @@ def _unit_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rows longer than `least` and their offsets, scaled to unit length."""
     length = np.linalg.norm(rows, axis=1)
-    kept = length > least
-    unit = rows[kept] / length[kept, None]
-    return unit, offset[kept] / length[kept]
+    chosen = length > least
+    size = length[chosen]
+    unit = rows[chosen] / size[:, None]
+    return unit, offset[chosen] / size
 
 
 def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -260,7 +294,8 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     passive = np.zeros(count, bool)
     barred = np.zeros(count, bool)
     for _ in range(_ROUNDS * count):
-        gradient = matrix.T @ (target - matrix @ x)
+        residual = target - matrix @ x
+        gradient = matrix.T @ residual
         gradient[passive | barred] = 0.0
         new = int(np.argmax(gradient))
         if gradient[new] <= _GRADIENT:
@@ -273,10 +308,14 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
             continue
         # go towards the trial until the first x is 0
         while (trial[passive] <= 0).any():
-            low = np.flatnonzero(passive & (trial <= 0))
-            steps = x[low] / (x[low] - trial[low])
-            x = x + steps.min() * (trial - x)
-            passive[low[steps == steps.min()]] = False
+            falls = passive & (trial <= 0)
+            low = np.flatnonzero(falls)
+            change = x[low] - trial[low]
+            steps = x[low] / change
+            shortest = steps.min()
+            x = x + shortest * (trial - x)
+            reached = low[steps == shortest]
+            passive[reached] = False
             trial = _on_support(matrix, target, passive)
         x = trial
         barred[:] = False
@@ -290,8 +329,9 @@ def _on_support(
     columns).
     """
     x = np.zeros(matrix.shape[1])
-    solved = np.linalg.lstsq(matrix[:, support], target, rcond=None)
-    x[support] = solved[0]
+    columns = matrix[:, support]
+    solution, *_ = np.linalg.lstsq(columns, target, rcond=None)
+    x[support] = solution
     return x
 
 
@@ -321,7 +361,8 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
         if np.ptp(unit) == 0:
             return unit[:, :1]
         return np.zeros((0, 1))
-    corners = np.vstack([np.zeros(rank), unit.T])
+    apex = np.zeros(rank)
+    corners = np.vstack([apex, unit.T])
     outward = ConvexHull(corners).equations
     through_apex = np.abs(outward[:, -1]) <= _INDEPENDENT
     normals = -outward[through_apex, :-1]
@@ -341,6 +382,9 @@ def _chord(
     """
     a = (steps**2).sum(1)
     b = (points * steps).sum(1)
-    inside = radius**2 - (points**2).sum(1)
-    root = np.sqrt(np.maximum(b**2 + a * inside, 0.0))
-    return (-b - root) / a, (-b + root) / a
+    c = radius**2 - (points**2).sum(1)
+    square = b**2 + a * c
+    root = np.sqrt(np.maximum(square, 0.0))
+    enters = (-b - root) / a
+    leaves = (-b + root) / a
+    return enters, leaves

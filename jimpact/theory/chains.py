@@ -61,16 +61,18 @@ def bilateral_motion(
 
     def acceleration(x: jax.Array) -> jax.Array:
         """`x'' = -M^-1 N K N^T x` (n,) [m/s^2] at displacements x (n,) [m]."""
-        return velocity_change(scene, -k * gap_velocity(scene, x))
+        force = -k * gap_velocity(scene, x)
+        return velocity_change(scene, force)
 
     # (x, x')' = flow (x, x')
-    displacements = jnp.eye(n, dtype=v.dtype)
-    pull = jax.vmap(acceleration, out_axes=1)(displacements)
-    zero = jnp.zeros((n, n), v.dtype)
-    identity = jnp.eye(n, dtype=v.dtype)
+    dtype = v.dtype
+    identity = jnp.eye(n, dtype=dtype)
+    pull = jax.vmap(acceleration, out_axes=1)(identity)
+    zero = jnp.zeros((n, n), dtype)
     flow = jnp.block([[zero, identity], [pull, zero]])
     # expm, not eigenvectors: those of equal frequencies have no derivative
-    start = jnp.concatenate([jnp.zeros_like(v), v])
+    at_rest = jnp.zeros_like(v)
+    start = jnp.concatenate([at_rest, v])
     transition = jax.scipy.linalg.expm(t * flow, max_squarings=64)
     end = transition @ start
     return end[:n], end[n:]
@@ -160,19 +162,25 @@ def separation_times(stiffness_ratio: float) -> SeparationTimes:
 
         def squeeze(t: Any) -> Any:
             """Indentation of the contact at time t, but for a positive factor."""
-            slow_part = slow * np.sin(low * t) / low
-            return slow_part + fast * np.sin(high * t) / high
+            of_slow = slow * np.sin(low * t) / low
+            of_fast = fast * np.sin(high * t) / high
+            return of_slow + of_fast
 
-        steps = int(2 * np.pi * high / low / _GRID) + 2
+        period_of_slow = 2 * np.pi * high / low
+        steps = int(period_of_slow / _GRID) + 2
         times = np.arange(1, steps) * _GRID / high
-        after = int(np.argmax(squeeze(times) <= 0))
-        last = times[after - 1]
-        return float(brentq(squeeze, last, times[after], xtol=1e-15, rtol=1e-15))
+        opened = squeeze(times) <= 0
+        number = int(np.argmax(opened))
+        begin = times[number - 1]
+        end = times[number]
+        return float(brentq(squeeze, begin, end, xtol=1e-15, rtol=1e-15))
 
     # Delta - 1 + g and Delta + 1 - g, written so that nothing cancels; root is Delta
     rising = g + (g * g - g) / (root + 1)
     falling = 1 + (1 - g) / (root + g)
-    return SeparationTimes(zero(rising, falling), zero(1.0, -1.0))
+    first = zero(rising, falling)
+    second = zero(1.0, -1.0)
+    return SeparationTimes(first, second)
 
 
 def nesterenko_speed(stiffness: Any, mass: Any, velocity: Any) -> jax.Array:

@@ -15,6 +15,7 @@ from jimpact.core.contact import (
     normalized_gap_velocity,
 )
 from jimpact.core.scene import Scene, velocity_change
+from jimpact.numerics.dense import unit_outside
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix
 from jimpact.theory.quasi_velocities import quasi_basis, to_quasi_velocities
@@ -146,9 +147,7 @@ def _box_multipliers(
     slack = jnp.concatenate([y - low, high - y])
     slack = jnp.where(bounded, slack, 1.0)  # a bound at infinity never binds
     matrix = jnp.block([[s, -s], [-s, s]])
-    both = bounded[:, None] & bounded[None, :]
-    identity = jnp.eye(2 * len(y), dtype=s.dtype)
-    matrix = jnp.where(both, matrix, identity)
+    matrix = unit_outside(matrix, bounded)
     # p = p_low - p_high is unique where S is regular, whatever the two parts are
     solution = solve_lcp(matrix, slack, regular=True)
     of_low = solution.z[: len(y)]

@@ -94,13 +94,16 @@ class Arcs:
         rad/s].
         """
         h = np.diff(self.instants)
-        mean = np.diff(self.places, axis=0) / h[:, None]
-        bend = (self.acceleration + self.own[:-1]) / 2 * h[:, None]
+        duration = h[:, None]
+        mean = np.diff(self.places, axis=0) / duration
+        of_flights = self.acceleration + self.own[:-1]
+        bend = of_flights / 2 * duration
         first = mean - bend
         last = mean + bend
         if self.flight.bends:
+            begin = np.zeros(1)
             for i in range(len(h)):
-                _, rates = self.flight.deviation(np.zeros(1), *self.ends(i))
+                _, rates = self.flight.deviation(begin, *self.ends(i))
                 first[i] += rates[0]
                 last[i] += rates[-1]
         return first, last
@@ -110,7 +113,8 @@ class Arcs:
         """Number of values of an end in `covariance`: place, instant, acceleration of
         its own.
         """
-        return 2 * self.places.shape[1] + 1
+        n = self.places.shape[1]
+        return 2 * n + 1
 
     def rows_of_instants(self) -> np.ndarray:
         """Rows (K,) of the instants of impacts in `covariance`."""
@@ -135,7 +139,9 @@ class Arcs:
         (n,).
         """
         pair = slice(i, i + 2)
-        return self.instants[pair], self.places[pair], self.own[i]
+        tau = self.instants[pair]
+        places = self.places[pair]
+        return tau, places, self.own[i]
 
     def velocities(self) -> tuple[np.ndarray, np.ndarray]:
         """Velocities v- (K, n) and v+ (K, n) [m/s, rad/s] of each impact, see the head
@@ -157,89 +163,107 @@ class Arcs:
         K = self.impacts
         n = self.places.shape[1]
         size = self.size
-        gain = np.zeros((K, 2, n, len(self.covariance)))
+        pair = 2 * size
+        unknowns = len(self.covariance)
+        gain = np.zeros((K, 2, n, unknowns))
         # flight i has v+ of the impact before it, v- of the one after it
         for i in range(K + 1):
             slopes = self._end_slopes(i)
             own = slice(i * size, (i + 2) * size)
-            common = slopes[:, :, 2 * size + self.flight.columns]
+            of_ends = slopes[:, :, :pair]
+            of_model = slopes[:, :, pair + self.flight.columns]
             for k, side, end in ((i - 1, 1, 0), (i, 0, 1)):
                 if 0 <= k < K:
-                    gain[k, side, :, own] = slopes[end, :, : 2 * size]
-                    gain[k, side, :, (K + 2) * size :] = common[end]
+                    of_impact = gain[k, side]  # a view
+                    of_impact[:, own] = of_ends[end]
+                    of_impact[:, (K + 2) * size :] = of_model[end]
         return gain
 
     def gain_with_places(self) -> np.ndarray:
         """Derivatives (K, 3, n, N) of v-, v+ and the place of each impact."""
         K = self.impacts
         n = self.places.shape[1]
-        of_places = np.zeros((K, 1, n, len(self.covariance)))
+        unknowns = len(self.covariance)
+        of_places = np.zeros((K, 1, n, unknowns))
         for k in range(K):
-            own = (k + 1) * self.size
-            of_places[k, 0, :, own : own + n] = np.eye(n)
-        return np.concatenate([self.gain(), of_places], axis=1)
+            first = (k + 1) * self.size
+            own = slice(first, first + n)
+            of_places[k, 0, :, own] = np.eye(n)
+        of_velocities = self.gain()
+        return np.concatenate([of_velocities, of_places], axis=1)
 
     def _end_slopes(self, i: int) -> np.ndarray:
         """Derivatives (2, n, W) of the velocities at both ends of flight i."""
         tau, places, own = self.ends(i)
         n = places.shape[1]
         size = self.size
-        each = np.arange(n)
+        pair = 2 * size
+        c = np.arange(n)  # coordinates
         h = tau[-1] - tau[0]
         mean = (places[-1] - places[0]) / h
-        slopes = np.zeros((2, n, 2 * size + n + 1))
-        for end, sign in ((0, -1.0), (1, 1.0)):
+        a = self.acceleration + own
+        slopes = np.zeros((2, n, pair + n + 1))
+        for of_end, sign in zip(slopes, (-1.0, 1.0)):
             # of the velocity in -h
-            slope = mean / h - sign * (self.acceleration + own) / 2
-            slopes[end, each, each] = -1 / h
-            slopes[end, each, size + each] = 1 / h
-            slopes[end, :, n] = slope
-            slopes[end, :, size + n] = -slope
-            slopes[end, each, 2 * size + each] = sign * h / 2
+            slope = mean / h - sign * a / 2
+            of_end[c, c] = -1 / h
+            of_end[c, size + c] = 1 / h
+            of_end[:, n] = slope
+            of_end[:, size + n] = -slope
+            of_end[c, pair + c] = sign * h / 2
         if self.flight.bends:
-            moved = self.flight.deviation_slopes(np.zeros(1), tau, places, own)[-1]
+            begin = np.zeros(1)
+            *_, moved = self.flight.deviation_slopes(begin, tau, places, own)
             slopes += _in_columns(moved, n)
-        slopes[:, :, n + 1 : size] = slopes[:, :, 2 * size : -1]
+        of_model = slopes[:, :, pair:-1]
+        slopes[:, :, n + 1 : size] = of_model
         return slopes
 
     @property
     def drag_error(self) -> float:
         """Standard error of an unknown drag, 0 of a known one [1/m]."""
         if self.flight.drag_unknown:
-            return float(np.sqrt(self.covariance[-1, -1]))
+            variance = self.covariance[-1, -1]
+            return float(np.sqrt(variance))
         return 0.0
 
     def instant_errors(self) -> np.ndarray:
         """Standard errors (K,) of the instants [s]."""
-        return np.sqrt(np.diag(self.covariance)[self.rows_of_instants()])
+        variances = np.diag(self.covariance)
+        of_instants = variances[self.rows_of_instants()]
+        return np.sqrt(of_instants)
 
     @cached_property
     def covariance_of_velocities(self) -> np.ndarray:
         """Covariance `G C G^T` (2nK, 2nK) of (v-, v+) of each impact in turn, G of
         `gain`.
         """
-        flat = self.gain().reshape(-1, len(self.covariance))
-        return flat @ self.covariance @ flat.T
+        C = self.covariance
+        G = self.gain().reshape(-1, len(C))
+        return G @ C @ G.T
 
     @property
     def covariance_with_places(self) -> np.ndarray:
         """Covariance (3nK, 3nK) of (v-, v+, place) of each impact in turn."""
-        flat = self.gain_with_places().reshape(-1, len(self.covariance))
-        return flat @ self.covariance @ flat.T
+        C = self.covariance
+        G = self.gain_with_places().reshape(-1, len(C))
+        return G @ C @ G.T
 
     def jumps(self) -> np.ndarray:
         """Largest `|v+ - v-| / error` over the coordinates of each impact (K,)."""
         pre, post = self.velocities()
         K, n = pre.shape
         blocks = self.covariance_of_velocities.reshape(K, 2, n, K, 2, n)
-        each = np.arange(K)
-        own = blocks[each, :, :, each]  # (K, 2, n, 2, n)
-        before = own[:, 0, :, 0]
-        after = own[:, -1, :, -1]
+        k = np.arange(K)
+        own = blocks[k, :, :, k]  # (K, 2, n, 2, n)
+        of_pre = own[:, 0, :, 0]
+        of_post = own[:, -1, :, -1]
         between = own[:, 0, :, -1]
-        variance = before + after - between - between.swapaxes(1, 2)
-        errors = np.sqrt(np.maximum(np.diagonal(variance, axis1=1, axis2=2), 1e-300))
-        return np.abs((post - pre) / errors).max(axis=1, initial=0.0)
+        covariance = of_pre + of_post - between - between.swapaxes(1, 2)
+        variances = np.diagonal(covariance, axis1=1, axis2=2)
+        errors = np.sqrt(np.maximum(variances, 1e-300))
+        jumps = np.abs((post - pre) / errors)
+        return jumps.max(axis=1, initial=0.0)
 
     def with_members(self, members: list[np.ndarray]) -> "Arcs":
         """The same arcs by other frames, before they are fitted."""
@@ -256,11 +280,14 @@ def _in_columns(slopes: np.ndarray, n: int) -> np.ndarray:
     flight.
     """
     size = 2 * n + 1
-    ends = np.arange(n + 1)
-    found = np.zeros((*slopes.shape[:-1], 2 * size + n + 1))
-    found[..., ends] = slopes[..., : n + 1]
-    found[..., size + ends] = slopes[..., n + 1 : 2 * n + 2]
-    found[..., 2 * size :] = slopes[..., 2 * n + 2 :]
+    own = n + 1  # place and instant of an end
+    pair = 2 * size
+    ends = np.arange(own)
+    found = np.zeros((*slopes.shape[:-1], pair + own))
+    first, second, model = np.split(slopes, [own, 2 * own], axis=-1)
+    found[..., ends] = first
+    found[..., size + ends] = second
+    found[..., pair:] = model
     return found
 
 
@@ -268,7 +295,9 @@ def _rows_of_instants(ends: int, n: int) -> np.ndarray:
     """Rows (ends - 2,) of the instants of impacts among (place, instant, own
     acceleration).
     """
-    return (np.arange(ends - 2) + 1) * (2 * n + 1) + n
+    size = 2 * n + 1
+    ends_of_impacts = np.arange(ends - 2) + 1
+    return ends_of_impacts * size + n
 
 
 class _Ends(NamedTuple):
@@ -303,17 +332,16 @@ class Start:
 
     def without(self, k: int) -> "Start":
         """The same without flight k, whose frames are left out."""
-        flights = [*self.flights[:k], *self.flights[k + 1 :]]
-        return replace(self, flights=flights, bent=np.delete(self.bent, k, axis=0))
+        flights = list(self.flights)
+        del flights[k]
+        bent = np.delete(self.bent, k, axis=0)
+        return replace(self, flights=flights, bent=bent)
 
     def joined_at(self, k: int) -> "Start":
         """The same with flights k and k + 1 as one."""
         two = slice(k, k + 2)
-        flights = [
-            *self.flights[:k],
-            np.concatenate(self.flights[two]),
-            *self.flights[k + 2 :],
-        ]
+        flights = list(self.flights)
+        flights[two] = [np.concatenate(flights[two])]
         bent = np.delete(self.bent, k, axis=0)
         bent[k] |= self.bent[k]
         return replace(self, flights=flights, bent=bent)
@@ -328,18 +356,21 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
     are divided among the flights anew.
     """
     t = frames.t
-    flights = [some[np.isfinite(frames.q[some]).any(axis=1)] for some in start.flights]
+    seen = np.isfinite(frames.q).any(axis=1)
+    flights = [rows[seen[rows]] for rows in start.flights]
     pool = np.concatenate(flights)
-    last = np.array([t[before[-1]] for before, _ in pairwise(flights)])
-    first = np.array([t[after[0]] for _, after in pairwise(flights)])
+    pairs = list(pairwise(flights))
+    last = np.array([t[earlier[-1]] for earlier, _ in pairs])
+    first = np.array([t[later[0]] for _, later in pairs])
     low = last - BEYOND * frames.step
     high = first + BEYOND * frames.step
     instants = start.instants
     if instants is None:
         instants = crossings(frames, flights, start.flight)
-    tau = np.concatenate([[t[pool[0]]], instants, [t[pool[-1]]]])
+    tau = _with_ends(t[pool], instants)
     places = between(tau, t, frames.q)
-    ends = _Ends(tau, places, np.zeros_like(places), start.flight)
+    no_own = np.zeros_like(places)
+    ends = _Ends(tau, places, no_own, start.flight)
     division = _Members(t, pool, start.contact, flights)
     problem = _Problem(frames, start.errors, start.bent, division.at(tau))
     known = start.instant_errors
@@ -351,23 +382,34 @@ def fit_arcs(frames: Frames, start: Start) -> Arcs:
         new = tau + change.tau
         room = LARGEST_MOVE * np.diff(tau)
         earlier, later = neighbours(room)
-        inner = np.clip(_inner(new), _inner(tau) - earlier, _inner(tau) + later)
-        new = np.concatenate([new[[0]], np.clip(inner, low, high), new[[-1]]])
+        inner = _inner(tau)
+        inner = np.clip(_inner(new), inner - earlier, inner + later)
+        new = _with_ends(new, np.clip(inner, low, high))
         moved = change.seconds(new - tau, ends)
         tau = new
         model = ends.flight.moved(change.common)
-        ends = _Ends(tau, ends.places + change.places, ends.own + change.own, model)
+        places = ends.places + change.places
+        own = ends.own + change.own
+        ends = _Ends(tau, places, own, model)
         if k < SETTLING and moving.any():
             problem = problem.with_members(division.at(tau))
         if k > 0 and moved <= SETTLED * frames.step:
             break
     normal, _ = problem.step(ends, moving)
     covariance = _inverse(normal)
-    own = _rows_of_instants(*ends.places.shape)[~moving]
-    covariance[own, own] = known[~moving] ** 2
+    every_row = _rows_of_instants(*ends.places.shape)
+    given = every_row[~moving]
+    covariance[given, given] = known[~moving] ** 2
     covariance = _of_places(covariance, problem.drift(ends))
     residual = problem.residual(ends)
     return Arcs(*ends, start.errors, covariance, problem.members, residual, start.bent)
+
+
+def _with_ends(times: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """The first of the times, the `inner` ones, and the last of the times."""
+    first = times[:1]
+    last = times[-1:]
+    return np.concatenate([first, inner, last])
 
 
 def crossings(frames: Frames, flights: list[np.ndarray], flight: Flight) -> np.ndarray:
@@ -379,53 +421,59 @@ def crossings(frames: Frames, flights: list[np.ndarray], flight: Flight) -> np.n
     """
     instants = np.zeros(len(flights) - 1)
     straight = flight.straight(frames)
-    lines = [_line(straight, some, flight.acceleration) for some in flights]
-    for k, ((at, p, v), (other, p_after, v_after)) in enumerate(pairwise(lines)):
-        low = frames.t[flights[k][-1]]
-        high = frames.t[flights[k + 1][0]]
-        a = flight.acceleration
+    a = flight.acceleration
+    t = frames.t
+    sigma = frames.sigma
+    lines = [_line(straight, rows, a) for rows in flights]
+    for k, (line, next_line) in enumerate(pairwise(lines)):
+        middle, p, v = line
+        next_middle, p_after, v_after = next_line
+        low = t[flights[k][-1]]
+        high = t[flights[k + 1][0]]
         # of the parabola around one middle, the line around the other one
-        shift = other - at
+        shift = next_middle - middle
         p_here = p_after - v_after * shift + a * shift**2 / 2
         v_here = v_after - a * shift
-        dp = (p_here - p) / frames.sigma
-        dv = (v_here - v) / frames.sigma
+        dp = (p_here - p) / sigma
+        dv = (v_here - v) / sigma
         size = float(dv @ dv)
+        since = np.inf
         if size > 0:
             since = -float(dp @ dv) / size
-        else:
-            since = np.inf
-        if low <= at + since <= high:
-            instants[k] = at + since
-        else:
-            instants[k] = (low + high) / 2
+        crossing = middle + since
+        if not low <= crossing <= high:
+            crossing = (low + high) / 2
+        instants[k] = crossing
     return instants
 
 
 def _line(
-    frames: Frames, some: np.ndarray, acceleration: np.ndarray
+    frames: Frames, rows: np.ndarray, acceleration: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Middle of a flight [s], place (n,) and velocity (n,) there, by lines of least
     squares.
+
+    A coordinate that was seen in no frame of it has place and velocity 0, one that was
+    seen in one the velocity 0.
     """
-    at = float(frames.t[some].mean())
+    middle = float(frames.t[rows].mean())
     n = frames.q.shape[1]
     place = np.zeros(n)
     velocity = np.zeros(n)
     for c in range(n):
-        ok = some[np.isfinite(frames.q[some, c])]
-        if not len(ok):
+        of_coordinate = frames.q[rows, c]
+        seen = np.isfinite(of_coordinate)
+        if not seen.any():
             continue
-        x = frames.t[ok] - at
-        y = frames.q[ok, c] - acceleration[c] * x**2 / 2
-        spread = x - x.mean()
+        x = frames.t[rows[seen]] - middle
+        y = of_coordinate[seen] - acceleration[c] * x**2 / 2
+        mean = x.mean()
+        spread = x - mean
         size = float(spread @ spread)
         if size > 0:
             velocity[c] = float(spread @ y) / size
-        else:
-            velocity[c] = 0.0
-        place[c] = y.mean() - velocity[c] * x.mean()
-    return at, place, velocity
+        place[c] = y.mean() - velocity[c] * mean
+    return middle, place, velocity
 
 
 @dataclass(frozen=True)
@@ -445,11 +493,14 @@ class _Members:
         `flights`.
         """
         x = self.t[self.pool]
-        low = np.searchsorted(x, _inner(tau) + self.contact / 2)
-        high = np.searchsorted(x, _inner(tau) - self.contact / 2)
+        inner = _inner(tau)
+        half = self.contact / 2
+        low = np.searchsorted(x, inner + half)
+        high = np.searchsorted(x, inner - half)
         starts = np.concatenate([[0], low])
         stops = np.concatenate([high, [len(x)]])
-        if (stops - starts).min() < 3:
+        lengths = stops - starts
+        if lengths.min() < 3:
             return self.flights
         return [self.pool[i:j] for i, j in zip(starts, stops)]
 
@@ -480,12 +531,15 @@ class _Change(NamedTuple):
         """Size of the step [s]: of instants, `moved`, and of places where the model
         bends.
         """
-        size = float(np.abs(moved).max(initial=0.0))
+        of_instants = float(np.abs(moved).max(initial=0.0))
         if not ends.flight.bends:
-            return size
+            return of_instants
         duration = ends.tau[-1] - ends.tau[0]
-        length = np.abs(np.diff(ends.places, axis=0)).max(initial=1e-300)
-        return max(size, duration * float(np.abs(self.places).max()) / length)
+        ways = np.abs(np.diff(ends.places, axis=0))
+        length = ways.max(initial=1e-300)
+        farthest = float(np.abs(self.places).max())
+        of_places = duration * farthest / length
+        return max(of_instants, of_places)
 
 
 class _Problem:
@@ -503,14 +557,17 @@ class _Problem:
         self.bent = bent
         self.members = members
         self.rows = np.concatenate(members)
-        lengths = [len(some) for some in members]
-        self.flights = np.repeat(np.arange(len(members)), lengths)
-        self.seen = [np.isfinite(x) for x in frames.q[self.rows].T]
+        lengths = list(map(len, members))
+        numbers = np.arange(len(members))
+        self.flights = np.repeat(numbers, lengths)
+        columns = frames.q[self.rows].T
+        self.seen = list(map(np.isfinite, columns))
         self.covariances = [self._covariance(c, ok) for c, ok in enumerate(self.seen)]
 
     def with_members(self, members: list[np.ndarray]) -> "_Problem":
         """The problem of another division; this one where it is the same."""
-        if all(map(np.array_equal, members, self.members)):
+        same = map(np.array_equal, members, self.members)
+        if all(same):
             return self
         return _Problem(self.frames, self.errors, self.bent, members)
 
@@ -524,7 +581,8 @@ class _Problem:
         relative = None
         if self.frames.relative is not None:
             relative = self.frames.relative[rows, c]
-        return self.errors.of(c, self.frames.t[rows], starts, relative), own[starts]
+        t = self.frames.t[rows]
+        return self.errors.of(c, t, starts, relative), own[starts]
 
     def arc(self, ends: _Ends) -> np.ndarray:
         """Places (R, n) of all frames in flights.
@@ -533,26 +591,29 @@ class _Problem:
         2`, and D of `bent`.
         """
         x = self.frames.t[self.rows]
-        since = x - ends.tau[self.flights]
-        until = ends.tau[self.flights + 1] - x
+        flight = self.flights
+        since = x - ends.tau[flight]
+        until = ends.tau[flight + 1] - x
         s = (since / (since + until))[:, None]
-        first = ends.places[self.flights]
-        last = ends.places[self.flights + 1]
-        a = ends.flight.acceleration + ends.own[self.flights]
-        arc = first * (1 - s) + last * s - a * (since * until / 2)[:, None]
+        first = ends.places[flight]
+        last = ends.places[flight + 1]
+        a = ends.flight.acceleration + ends.own[flight]
+        sag = (since * until / 2)[:, None]
+        arc = first * (1 - s) + last * s - a * sag
         if ends.flight.drag or ends.flight.force is not None:
             for i, some in self._flights():
                 pair = slice(i, i + 2)
-                where = (ends.tau[pair], ends.places[pair], ends.own[i])
-                arc[some] += ends.flight.deviation(x[some], *where)[0]
+                tau = ends.tau[pair]
+                places = ends.places[pair]
+                D, _ = ends.flight.deviation(x[some], tau, places, ends.own[i])
+                arc[some] += D
         return arc
 
     def residual(self, ends: _Ends) -> np.ndarray:
         """Residuals (T, n) in sigma, NaN where a frame is in no flight."""
         found = np.full(self.frames.q.shape, np.nan)
-        found[self.rows] = (
-            self.frames.q[self.rows] - self.arc(ends)
-        ) / self.errors.sigma
+        apart = self.frames.q[self.rows] - self.arc(ends)
+        found[self.rows] = apart / self.errors.sigma
         return found
 
     def slopes(self, ends: _Ends) -> np.ndarray:
@@ -562,32 +623,40 @@ class _Problem:
         """
         n = ends.places.shape[1]
         size = 2 * n + 1
-        each = np.arange(n)
+        two = 2 * size
+        c = np.arange(n)  # coordinates
+        flight = self.flights
         x = self.frames.t[self.rows]
-        since = (x - ends.tau[self.flights])[:, None]
-        until = (ends.tau[self.flights + 1] - x)[:, None]
+        since = (x - ends.tau[flight])[:, None]
+        until = (ends.tau[flight + 1] - x)[:, None]
         h = since + until
         s = since / h
-        a = ends.flight.acceleration + ends.own[self.flights]
-        rise = (ends.places[self.flights + 1] - ends.places[self.flights]) / h
-        slopes = np.zeros((len(x), n, 2 * size + n + 1))
-        slopes[:, each, each] = 1 - s
-        slopes[:, each, size + each] = s
+        a = ends.flight.acceleration + ends.own[flight]
+        way = ends.places[flight + 1] - ends.places[flight]
+        rise = way / h
+        slopes = np.zeros((len(x), n, two + n + 1))
+        slopes[:, c, c] = 1 - s
+        slopes[:, c, size + c] = s
         slopes[:, :, n] = -rise * (1 - s) + a * until / 2
         slopes[:, :, size + n] = -rise * s - a * since / 2
-        slopes[:, each, 2 * size + each] = -since * until / 2
+        slopes[:, c, two + c] = -since * until / 2
         if ends.flight.bends:
             for i, some in self._flights():
                 pair = slice(i, i + 2)
-                where = (x[some], ends.tau[pair], ends.places[pair], ends.own[i])
-                slopes[some] += _in_columns(ends.flight.deviation_slopes(*where)[0], n)
-        slopes[:, :, n + 1 : size] = slopes[:, :, 2 * size : -1]
+                tau = ends.tau[pair]
+                places = ends.places[pair]
+                own = ends.own[i]
+                bent, _ = ends.flight.deviation_slopes(x[some], tau, places, own)
+                slopes[some] += _in_columns(bent, n)
+        of_model = slopes[:, :, two:-1]
+        slopes[:, :, n + 1 : size] = of_model
         drift = self.drift(ends)
         for end in (0, 1):
             first = end * size
             of_places = slopes[:, :, first : first + n]
-            moves = drift[self.flights + end]
-            slopes[:, :, first + n] += np.einsum("rcp,rp->rc", of_places, moves)
+            moves = drift[flight + end]
+            with_places = np.einsum("rcp,rp->rc", of_places, moves)
+            slopes[:, :, first + n] += with_places
         return slopes
 
     def drift(self, ends: _Ends) -> np.ndarray:
@@ -598,15 +667,18 @@ class _Problem:
         without a jump that is seen exactly would hide what the others say of the
         instant.
         """
-        rise = np.diff(ends.places, axis=0) / np.diff(ends.tau)[:, None]
-        before, after = neighbours(np.concatenate([rise[[0]], rise, rise[[-1]]]))
-        return (before + after) / 2
+        duration = np.diff(ends.tau)
+        rise = np.diff(ends.places, axis=0) / duration[:, None]
+        earlier, later = neighbours(_with_ends(rise, rise))
+        return (earlier + later) / 2
 
     def _flights(self) -> list[tuple[int, slice]]:
         """Number and rows of each flight."""
-        stops = np.cumsum([len(some) for some in self.members])
-        starts = np.concatenate([[0], stops[:-1]])
-        return [(i, slice(*rows)) for i, rows in enumerate(zip(starts, stops))]
+        lengths = list(map(len, self.members))
+        stops = np.cumsum(lengths)
+        starts = stops - lengths
+        rows = zip(starts, stops)
+        return [(i, slice(*of_flight)) for i, of_flight in enumerate(rows)]
 
     def step(self, ends: _Ends, moving: np.ndarray) -> tuple[NormalMatrix, _Change]:
         """Normal matrix at these values, and the Gauss-Newton step from them.
@@ -618,26 +690,30 @@ class _Problem:
         """
         n = ends.places.shape[1]
         size = 2 * n + 1
-        columns = ends.flight.columns
-        used = np.concatenate([np.arange(2 * size), 2 * size + columns])
+        pair = 2 * size
+        model = pair + ends.flight.columns
+        used = np.concatenate([np.arange(pair), model])
         slopes = self.slopes(ends)[:, :, used]
         rest = self.frames.q[self.rows] - self.arc(ends)
-        width = len(used) + 1
+        last = len(used)  # the column of the residual
+        width = last + 1
         grams = np.zeros((len(self.members), width, width))
         for c, ok in enumerate(self.seen):
             covariance, flights = self.covariances[c]
             # of P only coordinate c of both ends moves this one, unless drag couples
             # them
-            own = np.arange(width - 1)
+            own = np.arange(last)
             if not ends.flight.bends:
-                common = np.flatnonzero(used == 2 * size + c)
-                own = np.concatenate([[c, n, n + 1 + c, size + c, size + n], common])
+                common = np.flatnonzero(used == pair + c)
+                of_begin = [c, n, n + 1 + c]
+                own = np.concatenate([of_begin, [size + c, size + n], common])
             terms = np.column_stack([slopes[ok, c][:, own], rest[ok, c]])
             weighted = covariance.solve(terms)
             products = terms[:, :, None] * weighted[:, None]
-            where = np.append(own, width - 1)
-            at = np.ix_(flights, where, where)
-            grams[at] += np.add.reduceat(products, covariance.flights.starts, axis=0)
+            starts = covariance.flights.starts
+            where = np.append(own, last)
+            block = np.ix_(flights, where, where)
+            grams[block] += np.add.reduceat(products, starts, axis=0)
         return self._solved(grams, ends, moving)
 
     def _solved(
@@ -656,24 +732,28 @@ class _Problem:
             rows = slice(i * size, (i + 2) * size)
             border[rows] += gram[:pair, pair:-1]
             right[rows] += gram[:pair, -1]
-        corner = grams[:, pair:-1, pair:-1].sum(axis=0)
-        right_b = grams[:, pair:-1, -1].sum(axis=0)
+        of_model = grams[:, pair:-1]
+        corner = of_model[:, :, pair:-1].sum(axis=0)
+        right_b = of_model[:, :, -1].sum(axis=0)
         instants = np.arange(count) * size + n
-        still = instants[np.concatenate([[True], ~moving, [True]])]
+        stays = np.concatenate([[True], ~moving, [True]])
         straight = np.ones((count, n), bool)
         straight[:-1] = ~self.bent
         end, coordinate = np.nonzero(straight)
         none = end * size + n + 1 + coordinate
-        fixed = np.concatenate([still, none])
-        bands = _banded(grams[:, :pair, :pair], count, size, fixed)
+        fixed = np.concatenate([instants[stays], none])
+        of_ends = grams[:, :pair, :pair]
+        bands = _banded(of_ends, count, size, fixed)
         border[fixed] = 0.0
         right[fixed] = 0.0
         normal = NormalMatrix(bands, border, corner, fixed)
         solved, common = _solve(normal, right, right_b)
-        of_ends = solved.reshape(count, size)
-        tau = of_ends[:, n]
-        places = of_ends[:, :n] + self.drift(ends) * tau[:, None]
-        return normal, _Change(tau, places, of_ends[:, n + 1 :], common)
+        changes = solved.reshape(count, size)
+        tau = changes[:, n]
+        along = self.drift(ends) * tau[:, None]
+        places = changes[:, :n] + along
+        own = changes[:, n + 1 :]
+        return normal, _Change(tau, places, own, common)
 
 
 def _of_places(covariance: np.ndarray, drift: np.ndarray) -> np.ndarray:
@@ -682,11 +762,13 @@ def _of_places(covariance: np.ndarray, drift: np.ndarray) -> np.ndarray:
     size = 2 * n + 1
     turned = covariance.copy()
     for i in range(count):
-        places = slice(i * size, i * size + n)
-        turned[places] += np.outer(drift[i], turned[i * size + n])
+        first = i * size
+        places = slice(first, first + n)
+        turned[places] += np.outer(drift[i], turned[first + n])
     for i in range(count):
-        places = slice(i * size, i * size + n)
-        turned[:, places] += np.outer(turned[:, i * size + n], drift[i])
+        first = i * size
+        places = slice(first, first + n)
+        turned[:, places] += np.outer(turned[:, first + n], drift[i])
     return turned
 
 
@@ -699,10 +781,11 @@ def _banded(blocks: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.n
     width = 2 * size - 1
     count = ends * size
     bands = np.zeros((width + 1, count))
+    every_end = np.arange(ends - 1) * size
     for i in range(2 * size):
         for j in range(i, 2 * size):
-            columns = np.arange(ends - 1) * size + j
-            bands[width - (j - i), columns] += blocks[:, i, j]
+            diagonal = width - (j - i)
+            bands[diagonal, every_end + j] += blocks[:, i, j]
     for k in fixed:
         for d in range(width + 1):
             bands[width - d, k] = 0.0
@@ -721,16 +804,22 @@ def _solve(
     right_b - B^T A^-1 right`. A has the bands, B is the border, C the corner.
     """
     bands, border, corner, _ = normal
-    scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
+    scale = _scale(bands)
     both = np.column_stack([right, border])
-    solved = scale[:, None] * solveh_banded(
-        _scaled(bands, scale), scale[:, None] * both
-    )
-    alone, by_border = np.split(solved, [1], axis=1)
-    alone = alone[:, 0]
-    schur = np.linalg.pinv(corner - border.T @ by_border, hermitian=True)
-    common = schur @ (right_b - border.T @ alone)
+    column = scale[:, None]
+    solved = column * solveh_banded(_scaled(bands, scale), column * both)
+    alone = solved[:, 0]
+    by_border = solved[:, 1:]
+    schur = corner - border.T @ by_border
+    rest = right_b - border.T @ alone
+    common = np.linalg.pinv(schur, hermitian=True) @ rest
     return alone - by_border @ common, common
+
+
+def _scale(bands: np.ndarray) -> np.ndarray:
+    """Scale (N,) that brings the diagonal of these upper bands to 1."""
+    diagonal = np.maximum(bands[-1], 1e-300)
+    return 1 / np.sqrt(diagonal)
 
 
 def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -742,7 +831,10 @@ def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
     count = bands.shape[1]
     scaled = np.zeros_like(bands)
     for d in range(width + 1):
-        scaled[width - d, d:] = bands[width - d, d:] * scale[d:] * scale[: count - d]
+        of_row = scale[d:]
+        of_column = scale[: count - d]
+        diagonal = bands[width - d, d:]
+        scaled[width - d, d:] = diagonal * of_row * of_column
     scaled[width] += ROUNDED
     return scaled
 
@@ -755,11 +847,14 @@ def _inverse(normal: NormalMatrix) -> np.ndarray:
     `[[A^-1 + A^-1 B R B^T A^-1, -A^-1 B R], [-R B^T A^-1, R]]`.
     """
     bands, border, corner, fixed = normal
-    scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
-    inverse = scale[:, None] * solveh_banded(_scaled(bands, scale), np.diag(scale))
+    scale = _scale(bands)
+    solved = solveh_banded(_scaled(bands, scale), np.diag(scale))
+    inverse = scale[:, None] * solved
     inverse[fixed, fixed] = 0.0
     if not corner.size:
         return (inverse + inverse.T) / 2
-    schur = np.linalg.pinv(corner - border.T @ inverse @ border, hermitian=True)
-    cross = -inverse @ border @ schur
-    return np.block([[inverse - cross @ border.T @ inverse, cross], [cross.T, schur]])
+    schur = corner - border.T @ inverse @ border
+    R = np.linalg.pinv(schur, hermitian=True)
+    cross = -inverse @ border @ R
+    of_ends = inverse - cross @ border.T @ inverse
+    return np.block([[of_ends, cross], [cross.T, R]])

@@ -38,7 +38,8 @@ def price(frames: int, n: int) -> float:
 
     At least `SMALLEST_JUMP^2`.
     """
-    return max(float((2 * n + 1) * np.log(frames)), SMALLEST_JUMP**2)
+    bic = (2 * n + 1) * np.log(frames)
+    return max(float(bic), SMALLEST_JUMP**2)
 
 
 def price_of_lost(n: int) -> float:
@@ -66,7 +67,8 @@ def divided(frames: Frames, acceleration: np.ndarray, shortest: int) -> Division
     search = _Search(frames, acceleration, shortest)
     for first in range(0, len(frames.t), BLOCK):
         search.add_block(first)
-    return Division(search.flights(), float(search.best[-1]))
+    cost = float(search.best[-1])
+    return Division(search.flights(), cost)
 
 
 @dataclass
@@ -91,7 +93,8 @@ class _Starts:
         new_xy = old_xy + offset * new_x + slope * new_xx
         added = offset**2 * w + 2 * offset * slope * new_x + slope**2 * new_xx
         new_yy = yy + 2 * offset * y + 2 * slope * old_xy + added
-        return _Starts(self.index, np.stack([w, new_x, new_xx, new_y, new_xy, new_yy]))
+        sums = np.stack([w, new_x, new_xx, new_y, new_xy, new_yy])
+        return _Starts(self.index, sums)
 
 
 class _Search:
@@ -101,39 +104,46 @@ class _Search:
 
     def __init__(self, frames: Frames, acceleration: np.ndarray, shortest: int) -> None:
         count, n = frames.q.shape
-        extent = np.nanmax(frames.q, axis=0) - np.nanmin(frames.q, axis=0)
+        highest = np.nanmax(frames.q, axis=0)
+        extent = highest - np.nanmin(frames.q, axis=0)
+        largest = max(extent.max(), 1e-300)
         self.t = frames.t
         self.good = np.isfinite(frames.q)
-        self.sigma = np.maximum(frames.sigma, LEAST_NOISE * max(extent.max(), 1e-300))
+        self.sigma = np.maximum(frames.sigma, LEAST_NOISE * largest)
         self.q = np.where(self.good, frames.q, 0.0)
         self.curve = acceleration / self.sigma
         self.shortest = shortest
         # two frames have twice that
-        self.least_spread = float(np.diff(frames.t).min()) ** 2 / 4
+        shortest_step = float(np.diff(frames.t).min())
+        self.least_spread = shortest_step**2 / 4
         self.price = price(count, n)
         self.lost = price_of_lost(n) * self.good.any(axis=1)
         self.best = np.zeros(count + 1)
         self.come = np.zeros(count + 1, int)
-        self.starts = _Starts(np.zeros(0, int), np.zeros((6, 0, n)))
+        no_index = np.zeros(0, int)
+        no_sums = np.zeros((6, 0, n))
+        self.starts = _Starts(no_index, no_sums)
         self.time = frames.t[0]
         self.place = self._place(0)
 
     def add_block(self, first: int) -> None:
         """Extend `best` by the frames of a block."""
-        some = slice(first, min(first + BLOCK, len(self.t)))
+        end = min(first + BLOCK, len(self.t))
         self._move_origin(first)
-        within = self._sums_of(some)  # (6, B + 1, n), from the start of the block
-        new = _Starts(np.arange(some.start, some.stop), -within[:, :-1])
+        within = self._sums_of(slice(first, end))  # (6, B + 1, n), from its start
+        frames = np.arange(first, end)
+        new = _Starts(frames, -within[:, :-1])
         index = np.concatenate([self.starts.index, new.index])
         sums = np.concatenate([self.starts.sums, new.sums], axis=1)
-        cost = self._costs(sums[:, :, None] + within[:, None, 1:])
-        late = index[:, None] > np.arange(some.start, some.stop)
+        since_starts = sums[:, :, None] + within[:, None, 1:]
+        cost = self._costs(since_starts)
+        late = index[:, None] > frames
         cost[late] = np.inf
-        begun = np.concatenate(
-            [self.best[self.starts.index], np.full(len(new.index), np.inf)]
-        )
-        old = len(self.starts.index)
-        for k, j in enumerate(range(some.start, some.stop)):
+        of_old = self.best[self.starts.index]
+        unknown = np.full(len(new.index), np.inf)
+        begun = np.concatenate([of_old, unknown])
+        old = len(of_old)
+        for k, j in enumerate(frames):
             begun[old + k] = self.best[j]
             total = begun + cost[:, k]
             i = int(np.argmin(total))
@@ -144,9 +154,10 @@ class _Search:
                 self.come[j + 1] = index[i]
             else:
                 self.come[j + 1] = j
-        worse = begun + cost[:, -1] + self.price - self.best[some.stop]
-        kept = self._kept(index, worse, some.stop)
-        self.starts = _Starts(index[kept], sums[:, kept] + within[:, None, -1])
+        worse = begun + cost[:, -1] + self.price - self.best[end]
+        stays = self._stays(index, worse, end)
+        to_end = sums[:, stays] + within[:, None, -1]
+        self.starts = _Starts(index[stays], to_end)
 
     def flights(self) -> list[np.ndarray]:
         """Frames of each flight of the cheapest division."""
@@ -165,16 +176,19 @@ class _Search:
         """
         some = slice(k, k + BLOCK)
         first = k + self.good[some].argmax(axis=0)
-        each = np.arange(self.q.shape[1])
-        before = getattr(self, "place", np.zeros(len(each)))
-        return np.where(self.good[first, each], self.q[first, each], before)
+        c = np.arange(len(first))  # coordinates
+        last_origin = getattr(self, "place", np.zeros(len(c)))
+        seen = self.good[first, c]
+        return np.where(seen, self.q[first, c], last_origin)
 
     def _move_origin(self, first: int) -> None:
         """Take the first frame of a block as origin of times and places."""
         dx = self.t[first] - self.time
         place = self._place(first)
-        offset = self.curve * dx**2 / 2 - (place - self.place) / self.sigma
-        self.starts = self.starts.moved(dx, self.curve * dx, offset)
+        moved = (place - self.place) / self.sigma
+        offset = self.curve * dx**2 / 2 - moved
+        slope = self.curve * dx
+        self.starts = self.starts.moved(dx, slope, offset)
         self.time = self.t[first]
         self.place = place
 
@@ -184,11 +198,12 @@ class _Search:
         """
         w = self.good[some].astype(float)
         x = (self.t[some] - self.time)[:, None]
-        y = w * ((self.q[some] - self.place) / self.sigma - self.curve * x**2 / 2)
+        apart = (self.q[some] - self.place) / self.sigma
+        y = w * (apart - self.curve * x**2 / 2)
         terms = np.stack([w, w * x, w * x**2, y, x * y, y * y])
-        return np.concatenate(
-            [np.zeros_like(terms[:, :1]), terms.cumsum(axis=1)], axis=1
-        )
+        zero = np.zeros_like(terms[:, :1])
+        sums = terms.cumsum(axis=1)
+        return np.concatenate([zero, sums], axis=1)
 
     def _costs(self, sums: np.ndarray) -> np.ndarray:
         """chi^2 (C, B) of flights from their sums (6, C, B, n); inf where too few were
@@ -203,15 +218,20 @@ class _Search:
         # 0 of one frame: not enough
         spread = np.maximum(xx - x * x / w, self.least_spread)
         shared = xy - x * y / w
-        cost = (yy - y * y / w - shared * shared / spread).sum(axis=2)
-        return np.where(enough, np.maximum(cost, 0.0), np.inf)
+        of_lines = yy - y * y / w - shared * shared / spread
+        cost = of_lines.sum(axis=2)
+        positive = np.maximum(cost, 0.0)
+        return np.where(enough, positive, np.inf)
 
-    def _kept(self, index: np.ndarray, worse: np.ndarray, end: int) -> np.ndarray:
+    def _stays(self, index: np.ndarray, worse: np.ndarray, end: int) -> np.ndarray:
         """True (C,) for starts that stay: recent ones, good ones, and older ones ever
         more rarely.
 
         Good: with a flight from there on the cost is `worse` by less than half a price.
         """
         age = end - index
-        power = np.ceil(np.log2(np.maximum(age / RECENT, 1.0))).astype(int)
-        return (index % 2**power == 0) | (worse < self.price / 2)
+        doublings = np.log2(np.maximum(age / RECENT, 1.0))
+        power = np.ceil(doublings).astype(int)
+        by_age = index % 2**power == 0
+        is_good = worse < self.price / 2
+        return by_age | is_good

@@ -37,7 +37,8 @@ def _twice_integrated() -> np.ndarray:
     1.
     """
     integrals = chebyshev.chebint(np.eye(NODES), 2)
-    left, right = (chebyshev.chebval(end, integrals) for end in (-1.0, 1.0))
+    left = chebyshev.chebval(-1.0, integrals)
+    right = chebyshev.chebval(1.0, integrals)
     integrals[0] -= (left + right) / 2
     integrals[1] -= (right - left) / 2
     return integrals
@@ -79,16 +80,20 @@ def bent(
     h = np.diff(tau)[:, :, None]
     chord = np.diff(places, axis=1)
     # velocity of the arc at the points
-    arc = chord / h + a[:, None] * h / 2 * _POINTS[:, None]
-    times = tau.mean(axis=1)[:, None] + h[:, :, 0] / 2 * _POINTS
+    steady = a[:, None] * h / 2
+    arc = chord / h + steady * _POINTS[:, None]
+    middle = tau.mean(axis=1)[:, None]
+    times = middle + h[:, :, 0] / 2 * _POINTS
     slowing = np.zeros_like(arc)
     length = np.abs(arc).max() * h.max()
     for _ in range(ROUNDS):
         v = arc + h / 2 * (_RATES @ slowing)
-        new = -k[:, None, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
+        speed = np.linalg.norm(v, axis=2, keepdims=True)
+        new = -k[:, None, None] * speed * v
         if force is not None:
             new = new + force(v, times, tau)
-        moved = np.abs(new - slowing).max() * h.max() ** 2
+        largest = np.abs(new - slowing).max()
+        moved = largest * h.max() ** 2
         slowing = new
         if not SETTLED * length < moved < DIVERGED * length:
             break
@@ -99,8 +104,10 @@ def bent(
             f"too much for a flight of {float(h.max()):.3g} s at "
             f"{float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
         )
-    u = 2 * (x - tau[:, :1]) / h[:, 0] - 1
-    D = (h / 2) ** 2 * (chebyshev.chebvander(u, NODES + 1) @ (_TWICE @ slowing))
+    since = x - tau[:, :1]
+    u = 2 * since / h[:, 0] - 1
+    twice = chebyshev.chebvander(u, NODES + 1)
+    D = (h / 2) ** 2 * (twice @ (_TWICE @ slowing))
     return D, h / 2 * (_END_RATES @ slowing)
 
 
@@ -120,22 +127,29 @@ def bent_slopes(
     """
     n = len(a)
     h = tau[1] - tau[0]
-    length = np.linalg.norm(places[1] - places[0]) + np.linalg.norm(a) * h**2 / 2
+    way = np.linalg.norm(places[1] - places[0])
+    length = way + np.linalg.norm(a) * h**2 / 2
     if not (length > 0):
         length = 1.0
     end = [length] * n + [h]
-    sizes = STEP * np.array(end + end + [length / h**2] * n + [1 / length])
-    moves = np.vstack([np.zeros(len(sizes)), np.diag(sizes)])
+    of_acceleration = [length / h**2] * n
+    sizes = STEP * np.array(end + end + of_acceleration + [1 / length])
+    none = np.zeros(len(sizes))
+    moves = np.vstack([none, np.diag(sizes)])
     first, last, rest = np.split(moves, [n + 1, 2 * n + 2], axis=1)
-    D, rates = bent(
-        x,
-        tau + np.stack([first[:, n], last[:, n]], axis=1),
-        places + np.stack([first[:, :n], last[:, :n]], axis=1),
-        a + rest[:, :n],
-        k + rest[:, n],
-        force,
-    )
-    of_places, of_rates = (np.moveaxis(y[1:] - y[0], 0, 2) / sizes for y in (D, rates))
+    moved_tau = np.stack([first[:, n], last[:, n]], axis=1)
+    moved_places = np.stack([first[:, :n], last[:, :n]], axis=1)
+    moved_a = a + rest[:, :n]
+    moved_k = k + rest[:, n]
+    D, rates = bent(x, tau + moved_tau, places + moved_places, moved_a, moved_k, force)
+
+    def slopes(values: np.ndarray) -> np.ndarray:
+        """Difference quotients (.., P) of values, the first ones not moved."""
+        changes = values[1:] - values[0]
+        return np.moveaxis(changes, 0, 2) / sizes
+
+    of_places = slopes(D)
+    of_rates = slopes(rates)
     return of_places, of_rates
 
 
@@ -152,7 +166,9 @@ def straightened(
     frames = np.arange(len(t))
     low = np.maximum(frames - 2, 0)
     high = np.minimum(frames + 2, len(t) - 1)
-    v = (whole[high] - whole[low]) / (t[high] - t[low])[:, None]
+    way = whole[high] - whole[low]
+    duration = t[high] - t[low]
+    v = way / duration[:, None]
     faster = cumulative_trapezoid(air(v, t), t, axis=0, initial=0)
     return q - cumulative_trapezoid(faster, t, axis=0, initial=0)
 
@@ -162,5 +178,6 @@ def between(times: np.ndarray, t: np.ndarray, q: np.ndarray) -> np.ndarray:
     seen.
     """
     seen = np.isfinite(q)
-    columns = [np.interp(times, t[ok], x[ok]) for x, ok in zip(q.T, seen.T)]
+    pairs = zip(q.T, seen.T)
+    columns = [np.interp(times, t[ok], x[ok]) for x, ok in pairs]
     return np.stack(columns, axis=1)

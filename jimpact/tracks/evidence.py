@@ -80,7 +80,8 @@ class Verdict:
         if not any(kept):
             return self
         flights = [some for some, stays in zip(self.flights, kept) if stays]
-        return replace(self, flights=flights, bent=self.bent[np.array(kept)])
+        stay = np.array(kept)
+        return replace(self, flights=flights, bent=self.bent[stay])
 
 
 def price_of_bend(frames: int) -> float:
@@ -125,18 +126,20 @@ class FlightCosts:
     def of(self, flights: Sequence[np.ndarray]) -> Costs:
         """Costs of these flights, lists of frames."""
         names = [(int(some[0]), int(some[-1])) for some in flights]
-        new = {
-            name: some for name, some in zip(names, flights) if name not in self.known
-        }
+        named = zip(names, flights)
+        new = {name: rows for name, rows in named if name not in self.known}
         if new:
-            found = self._computed(list(new.values()))
-            self.known |= {name: Costs(*x) for name, x in zip(new, zip(*found))}
+            found = zip(*self._computed(list(new.values())))
+            costs = (Costs(*of_flight) for of_flight in found)
+            self.known.update(zip(new, costs))
         rows = [self.known[name] for name in names]
-        return Costs(*(np.array(column) for column in zip(*rows)))
+        columns = map(np.array, zip(*rows))
+        return Costs(*columns)
 
     def of_pairs(self, flights: Sequence[np.ndarray]) -> Costs:
         """Costs (F - 1,) of neighbouring flights as one."""
-        return self.of([np.concatenate(two) for two in pairwise(flights)])
+        joined = map(np.concatenate, pairwise(flights))
+        return self.of(list(joined))
 
     def _computed(self, flights: Sequence[np.ndarray]) -> Costs:
         """Costs of flights that are not known."""
@@ -151,7 +154,8 @@ class FlightCosts:
             some = Coordinate.of(frames, flights, self.flight, c)
             if not len(some.t):
                 continue
-            ends[some.flights, :, c] = some.end_velocities(self.flight.acceleration[c])
+            acceleration = self.flight.acceleration[c]
+            ends[some.flights, :, c] = some.end_velocities(acceleration)
             covariance = self.errors.of(c, some.t, some.starts)
             grams = some.grams(covariance)
             log_det = covariance.log_det()
@@ -206,13 +210,9 @@ class CoordinateTask:
         acceleration = float(flight.acceleration[c])
         if flight.unknown[c]:
             some, acceleration = some.at_best(acceleration)
-        on_lines = Likelihood(
-            some=some,
-            sigma=known,
-            least=float(least_noise(frames.q)[c]),
-            fastest=fastest,
-            bent=np.zeros(len(some.starts), bool),
-        )
+        straight = np.zeros(len(some.starts), bool)
+        least = float(least_noise(frames.q)[c])
+        on_lines = Likelihood(some, known, least, fastest, straight)
         quick = on_lines.quick_waves(frames.step)
         return cls(on_lines, quick, acceleration, frames.step)
 
@@ -312,14 +312,15 @@ def held_rather(
     coordinate.
     """
     held = np.zeros(len(flights), bool)
-    for c in map(int, np.flatnonzero(flight.acceleration * ~flight.unknown)):
+    given = flight.acceleration * ~flight.unknown
+    for c in map(int, np.flatnonzero(given)):
         some = Coordinate.of(frames, flights, flight, c)
         size = np.add.reduceat(some.curve**2, some.starts)
-        excess = np.add.reduceat(some.curve * some.rest, some.starts) / np.maximum(
-            size, 1e-300
-        )
+        along = np.add.reduceat(some.curve * some.rest, some.starts)
+        excess = along / np.maximum(size, 1e-300)
         own = flight.acceleration[c]
-        held[some.flights] |= np.abs(excess + own) < abs(own) / 2
+        from_none = np.abs(excess + own)
+        held[some.flights] |= from_none < abs(own) / 2
     return held
 
 
@@ -360,8 +361,10 @@ def largest_waves(
     durations = [np.ptp(frames.t[some]) for some in flights]
     if SHARES.max() * sum(durations) < LONG_WAVES * frames.step:
         return Errors.white(frames.sigma)
-    time = max(WAVED * float(np.median(durations)), LONG_WAVES * frames.step)
-    waves = tuple((Wave(WAVE_SPEED * speed * time, time),) for speed in speeds)
+    usual = WAVED * float(np.median(durations))
+    time = max(usual, LONG_WAVES * frames.step)
+    sizes = (WAVE_SPEED * speed * time for speed in speeds)
+    waves = tuple((Wave(size, time),) for size in sizes)
     return Errors(frames.sigma, waves)
 
 
@@ -424,7 +427,8 @@ class _Task:
 
 def _cost(frames: Frames, verdict: Verdict) -> float:
     """Cost of all flights: of residuals, prices of flights and of waves."""
-    costs = FlightCosts(frames, verdict.flight, verdict.errors).of(verdict.flights)
+    known = FlightCosts(frames, verdict.flight, verdict.errors)
+    costs = known.of(verdict.flights)
     counts = map(len, verdict.errors.waves)
     of_waves = sum(price_of_waves(len(frames.t), count) for count in counts)
     least = np.minimum(costs.line, costs.parabola)
@@ -451,9 +455,11 @@ def _joined(
         by_line = both.line - two - start
         by_bend = both.least - two + LEAST_GAIN
         jumps = np.abs(alone.jumps())
-        beyond = (jumps / np.maximum(of_waves, 1e-300)).max(axis=1)
+        in_waves = jumps / np.maximum(of_waves, 1e-300)
+        beyond = in_waves.max(axis=1)
         saves = np.minimum(by_line, by_bend)
-        saves = np.where(beyond < 1, np.minimum(saves, beyond - 1), saves)
+        within = np.minimum(saves, beyond - 1)
+        saves = np.where(beyond < 1, within, saves)
         before = np.append(np.inf, saves)[:-1]
         _, after = neighbours(np.append(saves, np.inf))
         best = (saves <= before) & (saves <= after)
@@ -465,10 +471,16 @@ def _joined(
             if not taken or k > taken[-1] + 1:
                 taken.append(k)
         for k in reversed(taken):
-            counts["errors" if by_line[k] <= by_bend[k] else "bends"] += 1
-            flights[k : k + 2] = [np.concatenate(flights[k : k + 2])]
-    straight = np.zeros((len(flights), frames.q.shape[1]), bool)
-    return Verdict(flights, flight, errors, straight, counts["errors"], counts["bends"])
+            if by_line[k] <= by_bend[k]:
+                counts["errors"] += 1
+            else:
+                counts["bends"] += 1
+            two = slice(k, k + 2)
+            flights[two] = [np.concatenate(flights[two])]
+    n = frames.q.shape[1]
+    straight = np.zeros((len(flights), n), bool)
+    by_errors = counts["errors"]
+    return Verdict(flights, flight, errors, straight, by_errors, counts["bends"])
 
 
 def doubtful(

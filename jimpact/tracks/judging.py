@@ -66,7 +66,8 @@ def findings_of_input(
     seen = np.isfinite(q).all(axis=1)
     places = q[seen]
     if len(places) > 2:
-        same = (np.diff(places, axis=0) == 0).all(axis=1)
+        steps = np.diff(places, axis=0)
+        same = (steps == 0).all(axis=1)
         if DOUBLED <= same.mean() < 1:
             found.append(
                 f"{int(same.sum())} of {len(places)} frames repeat the one before to "
@@ -79,8 +80,10 @@ def findings_of_input(
         else:
             steps = np.zeros(1)
         # turns of 2 pi are unwrapped; what is left tells how far a frame turns
-        turned = np.abs((steps + np.pi) % (2 * np.pi) - np.pi)
-        if (steps > 3 * np.pi).any() or np.quantile(turned, 0.9) > np.pi / 2:
+        half_turn = np.pi
+        turned = np.abs((steps + half_turn) % (2 * half_turn) - half_turn)
+        many = np.quantile(turned, 0.9) > half_turn / 2
+        if many or (steps > 3 * half_turn).any():
             found.append(
                 f"Coordinate {c + 1} turns by more than a quarter of a turn from frame "
                 f"to frame: is it in degrees, or do the frames miss turns?"
@@ -107,9 +110,11 @@ def findings_of_turns(
     `p_values` (K,) of orientations that meet at impacts.
     """
     found = []
-    now, then = neighbours(e[np.isfinite(e).all(axis=1)])
-    cosines = np.minimum(np.abs((then * now).sum(axis=1)), 1.0)
-    if len(cosines) and np.quantile(2 * np.arccos(cosines), 0.9) > np.pi / 2:
+    seen = np.isfinite(e).all(axis=1)
+    now, then = neighbours(e[seen])
+    products = np.abs((then * now).sum(axis=1))
+    turned = 2 * np.arccos(np.minimum(products, 1.0))
+    if len(turned) and np.quantile(turned, 0.9) > np.pi / 2:
         found.append(
             "The body turns by more than a quarter of a turn from frame to frame: do "
             "the frames miss turns?"
@@ -128,7 +133,8 @@ def findings_of_turns(
             f"{np.sqrt(square / freedom):.2g} times as large. Perhaps `inertia` is "
             f"another, an impact was not found, or the orientations were smoothed."
         )
-    apart = np.flatnonzero(p_values < FALSE_ALARMS / 4 / max(len(p_values), 1))
+    limit = FALSE_ALARMS / 4 / max(len(p_values), 1)
+    apart = np.flatnonzero(p_values < limit)
     if apart.size:
         numbers = ", ".join(str(k + 1) for k in apart)
         found.append(
@@ -151,12 +157,15 @@ def findings_of_signs(
     some = slice(0, LOOKED_AT)
     frames = Frames(frames.t[some], frames.q[some], frames.sigma)
     found: list[str] = []
-    if not np.isfinite(frames.q).any(axis=0).all() or len(frames.t) < shortest:
+    seen = np.isfinite(frames.q).any(axis=0)
+    if len(frames.t) < shortest or not seen.all():
         return found
     stride = max(1, min(shortest, len(frames.t) // 8))
-    measured = np.array([curvature(frames.t, x, stride) for x in frames.q.T])
+    columns = frames.q.T
+    measured = np.array([curvature(frames.t, x, stride) for x in columns])
     for c in np.flatnonzero(measured * acceleration < 0):
-        other = np.where(np.arange(len(acceleration)) == c, -acceleration, acceleration)
+        other = acceleration.copy()
+        other[c] = -acceleration[c]
         stated = divided(frames, acceleration, shortest).cost
         mirrored = divided(frames, other, shortest).cost
         if mirrored < stated:
@@ -191,11 +200,17 @@ def findings_of_bodies(q: np.ndarray) -> list[str]:
     Third differences of every second, third, .. row are then far smaller than those of
     all.
     """
-    whole = np.array([median(np.abs(differences(x, 3))) for x in q.T])
+
+    def jumps(distance: int) -> np.ndarray:
+        """Median third differences (n,) of rows so far from each other."""
+        by_coordinate = (differences(x, 3, distance) for x in q.T)
+        return np.array([median(np.abs(x)) for x in by_coordinate])
+
+    whole = jumps(1)
     for bodies in range(2, MOST_BODIES + 1):
         if len(q) < 4 * bodies + bodies:
             break
-        own = np.array([median(np.abs(differences(x, 3, bodies))) for x in q.T])
+        own = jumps(bodies)
         if (own * ALTERNATING < whole).any():
             return [
                 f"Places alternate between {bodies} bodies from row to row: this is a "
@@ -272,9 +287,10 @@ def findings_of_doubts(doubts: np.ndarray) -> list[str]:
     """Finding of impacts that are doubtful (K,)."""
     if not doubts.any():
         return []
-    numbers = listed([str(k + 1) for k in np.flatnonzero(doubts)])
+    numbers = (str(k + 1) for k in np.flatnonzero(doubts))
+    impacts = listed(list(numbers))
     return [
-        f"Impact {numbers} may be none: a flight of another acceleration explains its "
+        f"Impact {impacts} may be none: a flight of another acceleration explains its "
         f"frames as well. Perhaps drag, a rolling shutter, or the acceleration is "
         f"wrong. `experiments` leaves it out unless `doubtful=True`."
     ]
@@ -312,18 +328,23 @@ def _of_curvatures(t: np.ndarray, arcs: Arcs) -> list[str]:
     acceleration of their own are told.
     """
     n = len(arcs.errors.sigma)
-    excess, error = excess_of(t, arcs.residual, arcs.errors.sigma, arcs.members)
+    sigma = arcs.errors.sigma
+    excess, error = excess_of(t, arcs.residual, sigma, arcs.members)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
     far[:, arcs.errors.waving] = False
     far |= arcs.bent
     excess = np.where(arcs.bent, arcs.own[:-1], excess)
-    rows = arcs.size * np.arange(len(arcs.members))[:, None] + n + 1 + np.arange(n)
-    own_error = np.sqrt(np.maximum(np.diag(arcs.covariance)[rows], 0.0))
+    of_flight = arcs.size * np.arange(len(arcs.members))
+    of_coordinate = n + 1 + np.arange(n)
+    rows = of_flight[:, None] + of_coordinate
+    variances = np.diag(arcs.covariance)[rows]
+    own_error = np.sqrt(np.maximum(variances, 0.0))
     error = np.where(arcs.bent, own_error, error)
     found = []
     for i, c in zip(*np.nonzero(far)):
-        same = far[:, c].sum() > 1 and len(set(np.sign(excess[far[:, c], c]))) == 1
+        signs = np.sign(excess[far[:, c], c])
+        same = len(signs) > 1 and len(set(signs)) == 1
         if same:
             why = (
                 "the acceleration, the scale of lengths or of times, or a rolling "
@@ -450,7 +471,8 @@ def _unused(frames: Frames, members: Sequence[np.ndarray], shortest: int) -> lis
     used[np.concatenate(members)] = True
     order = np.flatnonzero(used)
     found = []
-    for where, rows in (("first", seen[: order[0]]), ("last", seen[order[-1] + 1 :])):
+    parts = (("first", seen[: order[0]]), ("last", seen[order[-1] + 1 :]))
+    for where, rows in parts:
         count = int(rows.sum())
         if count >= shortest:
             found.append(
@@ -463,7 +485,8 @@ def _unused(frames: Frames, members: Sequence[np.ndarray], shortest: int) -> lis
                 f"other: an impact there is not found."
             )
     inner = slice(order[0], order[-1] + 1)
-    lost = int((seen[inner] & ~used[inner]).sum())
+    left_out = seen[inner] & ~used[inner]
+    lost = int(left_out.sum())
     if lost > UNUSED * seen[inner].sum() + 1:
         found.append(
             f"{lost} of {int(seen[inner].sum())} frames are left out: they fit no "

@@ -88,37 +88,35 @@ class Coordinate:
     ) -> "Coordinate":
         """Coordinate c of these flights, acceleration taken away."""
         rows = np.concatenate(flights)
-        number = np.repeat(np.arange(len(flights)), [len(some) for some in flights])
+        lengths = list(map(len, flights))
+        number = np.repeat(np.arange(len(flights)), lengths)
         ok = np.isfinite(frames.q[rows, c])
         rows = rows[ok]
         number = number[ok]
         starts = np.flatnonzero(np.diff(number, prepend=-1))
         t = frames.t[rows]
         since = t - _mean(t, starts)
-        places = frames.q[rows, c] - flight.acceleration[c] * since**2 / 2
+        bend = flight.acceleration[c] * since**2 / 2
+        places = frames.q[rows, c] - bend
         curve = _without_line(since, since**2 / 2, starts)
-        return cls(
-            t,
-            since,
-            curve,
-            _without_line(since, places, starts),
-            starts,
-            number[starts],
-            _slopes(since, places, starts),
-        )
+        rest = _without_line(since, places, starts)
+        slopes = _slopes(since, places, starts)
+        return cls(t, since, curve, rest, starts, number[starts], slopes)
 
     def end_velocities(self, acceleration: float) -> np.ndarray:
         """Velocities (F, 2) at the first and the last frame of each flight: the slope
         of its line, and what the `acceleration` of the model adds.
         """
-        last = np.append(self.starts[1:], len(self.t)) - 1
-        since = np.column_stack([self.since[self.starts], self.since[last]])
-        return np.broadcast_to(self.slopes, len(last))[:, None] + acceleration * since
+        stops = np.append(self.starts[1:], len(self.t))
+        ends = np.column_stack([self.starts, stops - 1])
+        of_lines = np.broadcast_to(self.slopes, len(stops))
+        return of_lines[:, None] + acceleration * self.since[ends]
 
     @property
     def counts(self) -> np.ndarray:
         """Frames (F,) of each flight."""
-        return np.diff(np.append(self.starts, len(self.t)))
+        stops = np.append(self.starts, len(self.t))
+        return np.diff(stops)
 
     @cached_property
     def frames(self) -> Flights:
@@ -127,10 +125,10 @@ class Coordinate:
 
     def grams(self, covariance: Covariance) -> np.ndarray:
         """`X^T C^-1 X` (F, 4, 4) of each flight, X of (1, t, curve, rest)."""
-        terms = np.column_stack(
-            [np.ones_like(self.t), self.since, self.curve, self.rest]
-        )
-        products = terms[:, :, None] * covariance.solve(terms)[:, None]
+        one = np.ones_like(self.t)
+        terms = np.column_stack([one, self.since, self.curve, self.rest])
+        weighted = covariance.solve(terms)
+        products = terms[:, :, None] * weighted[:, None]
         return np.add.reduceat(products, self.starts, axis=0)
 
     def at_best(self, acceleration: float) -> tuple["Coordinate", float]:
@@ -142,18 +140,19 @@ class Coordinate:
             more = float(self.curve @ self.rest) / size
         else:
             more = 0.0
-        return replace(self, rest=self.rest - more * self.curve), acceleration + more
+        rest = self.rest - more * self.curve
+        return replace(self, rest=rest), acceleration + more
 
     def of_long_flights(self, least: int) -> tuple["Coordinate", np.ndarray]:
         """The flights of so many frames or more, and which they are (F,)."""
         long = self.counts >= least
         rows = np.repeat(long, self.counts)
         ends = np.cumsum(self.counts[long])
-        starts = np.concatenate([[0], ends[:-1]]).astype(int)
-        t, since, curve, rest = (
-            x[rows] for x in (self.t, self.since, self.curve, self.rest)
-        )
-        return Coordinate(t, since, curve, rest, starts, self.flights[long]), long
+        starts = ends - self.counts[long]
+        columns = (self.t, self.since, self.curve, self.rest)
+        t, since, curve, rest = (x[rows] for x in columns)
+        flights = self.flights[long]
+        return Coordinate(t, since, curve, rest, starts, flights), long
 
     def in_pieces(self, length: int, most: int) -> "Coordinate":
         """Pieces of flights, of `length` frames at most, each with a line of its own.
@@ -162,7 +161,8 @@ class Coordinate:
         errors are. Of N > `most` frames in all only each k-th piece remains, with
         k = N / `most` rounded up. `rest` and `curve` lose their lines in each piece.
         """
-        of_frame = np.repeat(np.arange(len(self.starts)), self.counts)
+        numbers = np.arange(len(self.starts))
+        of_frame = np.repeat(numbers, self.counts)
         place = np.arange(len(self.t)) - self.starts[of_frame]
         begins = np.flatnonzero(place % length == 0)
         ends = np.append(begins[1:], len(self.t))
@@ -170,41 +170,34 @@ class Coordinate:
         k = -(-len(self.t) // most)
         begins = begins[enough][::k]
         ends = ends[enough][::k]
-        rows = np.concatenate([np.arange(*pair) for pair in zip(begins, ends)])
-        starts = np.cumsum(np.append(0, ends - begins))[:-1]
+        pieces = [np.arange(*pair) for pair in zip(begins, ends)]
+        rows = np.concatenate(pieces)
+        lengths = ends - begins
+        starts = np.cumsum(lengths) - lengths
         t = self.t[rows]
         since = t - _mean(t, starts)
         curve = _without_line(since, since**2 / 2, starts)
         rest = _without_line(since, self.rest[rows], starts)
-        return Coordinate(
-            t=t,
-            since=since,
-            curve=curve,
-            rest=rest,
-            starts=starts,
-            flights=self.flights[of_frame[begins]],
-        )
+        flights = self.flights[of_frame[begins]]
+        return Coordinate(t, since, curve, rest, starts, flights)
 
     def together(self, most: int) -> tuple["Coordinate", int]:
         """Means of so many frames in a row that `most` are left, and of how many each
         is.
         """
         size = max(1, len(self.t) // most)
-        size = min(size, max(1, int(self.counts.min()) // 4))
+        smallest = int(self.counts.min())
+        size = min(size, max(1, smallest // 4))
         if size == 1:
             return self, 1
-        begin = np.concatenate(
-            [
-                first + size * np.arange(count // size)
-                for first, count in zip(self.starts, self.counts)
-            ]
-        )
+        counts = self.counts // size
+        groups = [first + size * np.arange(k) for first, k in zip(self.starts, counts)]
+        begin = np.concatenate(groups)
         rows = begin[:, None] + np.arange(size)
-        number = np.repeat(np.arange(len(self.starts)), self.counts // size)
+        number = np.repeat(np.arange(len(counts)), counts)
         starts = np.flatnonzero(np.diff(number, prepend=-1))
-        t, since, curve, rest = (
-            x[rows].mean(axis=1) for x in (self.t, self.since, self.curve, self.rest)
-        )
+        columns = (self.t, self.since, self.curve, self.rest)
+        t, since, curve, rest = (x[rows].mean(axis=1) for x in columns)
         return Coordinate(t, since, curve, rest, starts, self.flights), size
 
 
@@ -219,7 +212,8 @@ def _slopes(since: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarray:
     0 there.
     """
     size = np.add.reduceat(since * since, starts)
-    return np.add.reduceat(since * y, starts) / np.where(size > 0, size, 1.0)
+    size = np.where(size > 0, size, 1.0)
+    return np.add.reduceat(since * y, starts) / size
 
 
 def _without_line(since: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -235,13 +229,13 @@ def residual_squares(grams: np.ndarray, terms: int) -> np.ndarray:
     """
     normal = grams[:, :terms, :terms]
     right = grams[:, :terms, -1]
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
+    diagonal = np.diagonal(normal, axis1=1, axis2=2)
+    scale = 1 / np.sqrt(np.maximum(diagonal, 1e-300))
     normal = normal * scale[:, :, None] * scale[:, None]
     right = right * scale
     normal = normal + ROUNDED * np.eye(terms)
-    explained = (right * np.linalg.solve(normal, right[:, :, None])[:, :, 0]).sum(
-        axis=1
-    )
+    solution = np.linalg.solve(normal, right[:, :, None])
+    explained = (right * solution[:, :, 0]).sum(axis=1)
     return np.maximum(grams[:, -1, -1] - explained, 0.0)
 
 
@@ -323,7 +317,8 @@ class Likelihood:
         these are many, in the longer flights; none unless they pay.
         """
         # flights of half of all frames have so many or more
-        common = int(median(np.repeat(self.some.counts, self.some.counts)))
+        counts = self.some.counts
+        common = int(median(np.repeat(counts, counts)))
         enough, taken = self.some.of_long_flights(common)
         few, size = enough.together(MOST_FRAMES)
         if self.sigma is None and not beside:
@@ -331,7 +326,8 @@ class Likelihood:
         else:
             known = self.noise() / size**0.5
         bent = self.bent[taken]
-        binned = Likelihood(few, known, self.least / size**0.5, self.fastest, bent)
+        least = self.least / size**0.5
+        binned = Likelihood(few, known, least, self.fastest, bent)
         shortest = step * max(LEAST_TIME, LEAST_MEANS * size)
         for wave in beside:
             shortest = max(shortest, SLOWER * wave.time)
@@ -357,7 +353,8 @@ class Likelihood:
         """White errors as given; unknown ones by the noise from frame to frame."""
         if self.sigma is not None:
             return self.sigma
-        shown = float(noise(self.some.t, self.some.rest[:, None])[0])
+        by_frame = noise(self.some.t, self.some.rest[:, None])
+        shown = float(by_frame[0])
         return max(shown, self.least)
 
     def white(self) -> Likely:
@@ -386,19 +383,22 @@ class Likelihood:
         """
         rest = self.some.rest
         if self.bent.any():
-            curve = self.some.curve * np.repeat(self.bent, self.some.counts)
-            size = np.add.reduceat(curve * curve, self.some.starts)
-            share = np.add.reduceat(curve * rest, self.some.starts) / np.maximum(
-                size, 1e-300
-            )
+            of_frame = np.repeat(self.bent, self.some.counts)
+            curve = self.some.curve * of_frame
+            starts = self.some.starts
+            size = np.add.reduceat(curve * curve, starts)
+            along = np.add.reduceat(curve * rest, starts)
+            share = along / np.maximum(size, 1e-300)
             rest = rest - np.repeat(share, self.some.counts) * curve
         some = replace(self.some, rest=rest)
         for frames in BINS:
             enough, taken = some.of_long_flights(4 * frames)
             if not taken.any():
                 break
-            few, count = enough.together(max(1, len(enough.t) // frames))
-            freedom = len(few.t) - 2 * len(few.starts) - int(self.bent[taken].sum())
+            left = max(1, len(enough.t) // frames)
+            few, count = enough.together(left)
+            bends = int(self.bent[taken].sum())
+            freedom = len(few.t) - 2 * len(few.starts) - bends
             if count < frames or freedom <= 0:
                 break
             square = float(few.rest @ few.rest) * count / sigma**2
@@ -412,10 +412,10 @@ class Likelihood:
         """The most likely waves with a time above `shortest` [s], beside known ones;
         none unless they pay.
         """
-        spans = np.add.reduceat(
-            np.diff(self.some.t, append=self.some.t[-1]), self.some.starts
-        )
-        span = min(float(spans.max()), float(np.ptp(self.some.t)))
+        t = self.some.t
+        steps = np.diff(t, append=t[-1])
+        spans = np.add.reduceat(steps, self.some.starts)
+        span = min(float(spans.max()), float(np.ptp(t)))
         times = span * SHARES
         if beside:
             sigma = self.noise()
@@ -489,23 +489,20 @@ class Likelihood:
         square = 0.0
         for terms, some in ((2, ~self.bent), (3, self.bent)):
             if some.any():
-                _, logs = np.linalg.slogdet(grams[some, :terms, :terms])
+                of_flights = grams[some]
+                _, logs = np.linalg.slogdet(of_flights[:, :terms, :terms])
                 log_det += logs.sum()
-                square += float(residual_squares(grams[some], terms).sum())
+                square += float(residual_squares(of_flights, terms).sum())
         sigma = self.sigma
         if sigma is None:
             sigma = max(float(np.sqrt(square / freedom)), self.least)
         chi = square / sigma**2
         cost = chi + 2 * freedom * np.log(sigma) + log_det
-        evidence = (
-            chi + 2 * len(self.some.t) * np.log(sigma) + covariance.log_det().sum()
-        )
-        return Likely(
-            float(cost),
-            sigma,
-            tuple(wave.scaled(sigma) for wave in waves),
-            float(evidence) + price_of_waves(len(self.some.t), len(waves)),
-        )
+        frames = len(self.some.t)
+        evidence = chi + 2 * frames * np.log(sigma) + covariance.log_det().sum()
+        priced = float(evidence) + price_of_waves(frames, len(waves))
+        in_units = tuple(wave.scaled(sigma) for wave in waves)
+        return Likely(float(cost), sigma, in_units, priced)
 
     def _beside(self, waves: tuple[Wave, ...]) -> Likely:
         """White errors beside these waves, by turns from those of differences on."""
@@ -513,6 +510,8 @@ class Likelihood:
         if self.sigma is None:
             free = replace(self, sigma=None)
             for _ in range(TURNS):
-                sigma = free.at(tuple(w.scaled(1 / sigma) for w in waves)).sigma
+                in_sigma = tuple(wave.scaled(1 / sigma) for wave in waves)
+                sigma = free.at(in_sigma).sigma
         known = replace(self, sigma=sigma)
-        return known.at(tuple(wave.scaled(1 / sigma) for wave in waves))
+        in_sigma = tuple(wave.scaled(1 / sigma) for wave in waves)
+        return known.at(in_sigma)

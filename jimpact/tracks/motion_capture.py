@@ -68,13 +68,13 @@ class Capture:
         """The column "MARKER axis" (T,), and its axis."""
         marker, _, axis = name.strip().rpartition(" ")
         axis = axis.lower()
-        found = self._marker(marker)
+        found = self.full_name(marker)
         if found is None or axis not in self.axes[found]:
             raise ValueError(self._missing(path, name, marker, axis))
         place = self.axes[found].index(axis)
         return self.values[found][:, place], axis
 
-    def _marker(self, name: str) -> str | None:
+    def full_name(self, name: str) -> str | None:
         """Full name of a marker; where 'subject:marker' is meant, the marker alone will
         do.
         """
@@ -88,7 +88,7 @@ class Capture:
     def _missing(self, path: str | Path, name: str, marker: str, axis: str) -> str:
         """Sentence of an error: what is missing, and what is there."""
         there = ", ".join(self.axes)
-        whole = self._marker(name.strip())
+        whole = self.full_name(name.strip())
         if whole is not None:
             axes = ", ".join(self.axes[whole])
             return f"{path}: marker `{name}` needs an axis, '{name} x': it has {axes}."
@@ -97,7 +97,7 @@ class Capture:
                 f"{path}: axis `{name}` needs a marker, 'MARKER {name}', one of "
                 f"{there}."
             )
-        found = self._marker(marker)
+        found = self.full_name(marker)
         if found is not None:
             return (
                 f"{path}: marker `{marker}` has no axis `{axis}`, but "
@@ -206,14 +206,17 @@ def _rows(
                 f"as the head has columns, but has {len(cells)}."
             )
         row = [_number(path, line, cell) for cell in cells[:width]]
-        found.extend(row + [np.nan] * (width - len(row)))
+        missing = [np.nan] * (width - len(row))
+        found.extend(row + missing)
         if len(cells) > 1:
-            digits = max(digits, len(cells[1].strip().partition(".")[-1]))
+            *_, decimals = cells[1].strip().partition(".")
+            digits = max(digits, len(decimals))
     if not found:
         raise ValueError(
             f"{path}: there are no lines of numbers below the names of the markers."
         )
-    return _Numbers(np.array(found).reshape(-1, width), 10.0**-digits)
+    numbers = np.array(found).reshape(-1, width)
+    return _Numbers(numbers, 10.0**-digits)
 
 
 def _cells(lines: Lines, separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -258,7 +261,8 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
     for row in rows:
         _, cells = row
         key = cells[0].strip()
-        if is_number(key) or key.lower() in ("frame", "time") or (head and not key):
+        is_head = key.lower() in ("frame", "time")
+        if is_number(key) or is_head or (head and not key):
             names_of_columns = any(cells) and not any(map(is_number, cells))
             if not names_of_columns:
                 rows = chain([row], rows)
@@ -273,7 +277,8 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
         )
     names = [name for name in head["MARKER_NAMES"] if name]
     _check_once(path, names)
-    first = next((row for row in rows if len(row[1]) > 1), (0, [""]))
+    of_numbers = (row for row in rows if len(row[1]) > 1)
+    first = next(of_numbers, (0, [""]))
     _, cells = first
     before = max(_width(cells) - 3 * len(names), 0)  # frame, time
     if before > 2:
@@ -281,12 +286,15 @@ def _qualisys(path: Path, lines: Lines) -> Capture:
             f"{path}: lines have {before} cells more than {len(names)} markers need."
         )
     width = before + 3 * len(names)
-    values = _rows(path, chain([first], rows), width, counted=not before).values
+    body = _rows(path, chain([first], rows), width, counted=not before)
+    values = body.values
     places = values[:, before:].reshape(len(values), len(names), 3)
     lost = (places == 0).all(axis=2)
     places = np.where(lost[:, :, None], np.nan, places)
-    _check_count(path, "NO_OF_FRAMES", (head.get("NO_OF_FRAMES") or [""])[0], values)
-    rate = _stated(path, "FREQUENCY", (head.get("FREQUENCY") or [""])[0])
+    frames_in_words, *_ = head.get("NO_OF_FRAMES") or [""]
+    _check_count(path, "NO_OF_FRAMES", frames_in_words, values)
+    rate_in_words, *_ = head.get("FREQUENCY") or [""]
+    rate = _stated(path, "FREQUENCY", rate_in_words)
     t = _times_of_qualisys(values[:, :before], rate)
     found = dict(zip(names, places.swapaxes(0, 1)))
     return Capture("Qualisys TSV", dict.fromkeys(names, PLACE), found, None, rate, t)
@@ -326,7 +334,8 @@ def _width(cells: Sequence[str]) -> int:
 
     Lost markers leave three empty cells; a separator at the end leaves one more.
     """
-    empty = sum(1 for _ in takewhile(lambda cell: not cell.strip(), reversed(cells)))
+    from_end = reversed(cells)
+    empty = len(list(takewhile(lambda cell: not cell.strip(), from_end)))
     return len(cells) - (empty % 3 == 1)
 
 
@@ -419,9 +428,10 @@ def _optitrack(path: Path, lines: Lines) -> Capture:
             kind = ""
         if kind in ("Position", "Rotation") and k < len(names) and names[k]:
             axis = axes[k].lower()
-            places.setdefault(names[k], {})[
-                axis if kind == "Position" else f"q{axis}"
-            ] = k
+            if kind == "Rotation":
+                axis = f"q{axis}"
+            of_name = places.setdefault(names[k], {})
+            of_name[axis] = k
     turns = head.get("Rotation Type", "Quaternion")
     if turns != "Quaternion":  # angles about axes are no quaternions
         places = {
@@ -435,11 +445,9 @@ def _optitrack(path: Path, lines: Lines) -> Capture:
         x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()
     }
     found = {x: values[:, [places[x][a] for a in order[x]]] for x in places}
-    rate = _stated(
-        path,
-        "rate",
-        head.get("Export Frame Rate") or head.get("Capture Frame Rate", ""),
-    )
+    export_rate = head.get("Export Frame Rate")
+    rate_in_words = export_rate or head.get("Capture Frame Rate", "")
+    rate = _stated(path, "rate", rate_in_words)
     unit = _unit(path, "Length Units", head.get("Length Units", ""))
     frames, times, *_ = values.T
     t = _times(path, frames, times, rate, body.digit)
@@ -484,9 +492,8 @@ def _vicon(path: Path, lines: Lines) -> Capture:
         raise ValueError(
             f"{path}, line 5: all units must be the same, but are {sorted(units)}."
         )
-    part = takewhile(
-        lambda row: any(cell.strip() for cell in row[1]), _cells(lines, ",")
-    )
+    every_row = _cells(lines, ",")
+    part = takewhile(lambda row: any(cell.strip() for cell in row[1]), every_row)
     values = _rows(path, part, HEAD + 3 * len(names)).values
     found = _in_threes(names, _without_head(values))
     frames = values[:, 0]
@@ -506,7 +513,8 @@ def _c3d(path: Path) -> Capture:
     file = ezc3d.c3d(str(path))
     point = file["parameters"]["POINT"]
     x, y, z, _ = file["data"]["points"]  # each of markers and frames
-    names = [str(name).strip() for name in point["LABELS"]["value"]][: len(x)]
+    labels = point["LABELS"]["value"][: len(x)]
+    names = [str(name).strip() for name in labels]
     _check_once(path, names)
     places = np.stack([x, y, z], axis=-1)  # (markers, T, 3)
     lost = file["data"]["meta_points"]["residuals"][0] < 0
@@ -516,9 +524,8 @@ def _c3d(path: Path) -> Capture:
     first = int(file["header"]["points"]["first_frame"])  # from 0
     t = (first + np.arange(places.shape[1])) / rate
     unit = _unit(path, "POINT:UNITS", str(units[0]))
-    return Capture(
-        "C3D", dict.fromkeys(names, PLACE), dict(zip(names, places)), unit, rate, t
-    )
+    found = dict(zip(names, places))
+    return Capture("C3D", dict.fromkeys(names, PLACE), found, unit, rate, t)
 
 
 def check_not_zero(path: str | Path, name: str, places: np.ndarray) -> None:

@@ -35,7 +35,8 @@ def with_turns(
     sigma (3,) of turns about the axes of the body [rad]; None: taken from the
     residuals.
     """
-    frames = [some[np.isfinite(e[some, 0])] for some in track.flights]
+    seen = np.isfinite(e[:, 0])
+    frames = [rows[seen[rows]] for rows in track.flights]
     for k, some in enumerate(frames, 1):
         if len(some) < 2:
             raise ValueError(
@@ -48,22 +49,26 @@ def with_turns(
     else:
         given = sigma
     notes = []
-    fitted = [fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)]
+    times = [track.t[rows] for rows in frames]
+    measured = list(zip(times, turns))
+    fitted = [fit_turning(t, turn, given, inertia) for t, turn in measured]
     if sigma is None:  # each flight takes two values of each axis
-        square = sum((rest**2).sum(axis=0) for _, rest in fitted)
-        given = np.sqrt(square / max(sum(map(len, frames)) - 2 * len(frames), 1))
-        given = np.maximum(given, np.finfo(float).eps ** 0.5)
-        fitted = [
-            fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)
-        ]
-        notes = findings_of_noise(noise(track.t, turns_since_first(e)), given, first=4)
-    arcs, flights, covariance, p_values = _met(track, [flight for flight, _ in fitted])
+        squares = [(rest**2).sum(axis=0) for _, rest in fitted]
+        count = sum(map(len, frames)) - 2 * len(frames)
+        given = np.sqrt(sum(squares) / max(count, 1))
+        rounding = np.finfo(float).eps ** 0.5
+        given = np.maximum(given, rounding)
+        fitted = [fit_turning(t, turn, given, inertia) for t, turn in measured]
+        jitter = noise(track.t, turns_since_first(e))
+        notes = findings_of_noise(jitter, given, first=4)
+    of_fits = [flight for flight, _ in fitted]
+    arcs, flights, covariance, p_values = _met(track, of_fits)
     residual = np.full((len(e), 3), np.nan)
-    for flight, some, measured in zip(flights, frames, turns):
-        residual[some] = (
-            flight.at(track.t[some]).turn.inv() * measured
-        ).as_rotvec() / given
-    arcs = replace(arcs, residual=np.hstack([track.residual, residual]))
+    for flight, rows, (t, turn) in zip(flights, frames, measured):
+        to_measured = flight.at(t).turn.inv() * turn
+        residual[rows] = to_measured.as_rotvec() / given
+    of_all = np.hstack([track.residual, residual])
+    arcs = replace(arcs, residual=of_all)
     # meetings give back three, for half an instant
     taken = 6 * len(flights) - 2 * len(p_values)
     notes += findings_of_turns(e, given, residual, p_values, taken)
@@ -94,10 +99,11 @@ def _met(
     g of its turn at x_0.
     """
     first = track.arcs
-    impacts = len(track.arcs.instants) - 2
+    impacts = first.impacts
     # values of the arcs: places and instant of each end, acceleration
     free = len(first.covariance)
-    C = block_diag(first.covariance, *(flight.covariance for flight in flights))
+    of_flights = (flight.covariance for flight in flights)
+    C = block_diag(first.covariance, *of_flights)
     change = np.zeros(len(C))
     arcs = first
     turned = flights
@@ -108,14 +114,16 @@ def _met(
         apart, H = _apart(arcs, turned, track.t.mean(), free)
         S = H @ C @ H.T
         if k == 0:
-            each = apart.reshape(-1, 3), diagonal_blocks(S, 3)
-            p_values = np.array(
-                [chi2.sf(x @ np.linalg.solve(A, x), 3) for x, A in zip(*each)]
-            )
-        change = C @ H.T @ np.linalg.solve(S, H @ change - apart)
+            of_impacts = zip(apart.reshape(-1, 3), diagonal_blocks(S, 3))
+            squares = [x @ np.linalg.solve(A, x) for x, A in of_impacts]
+            p_values = np.array([chi2.sf(square, 3) for square in squares])
+        multipliers = np.linalg.solve(S, H @ change - apart)
+        change = C @ H.T @ multipliers
         arcs = first.changed(change[:free])
-        turned = [f.moved(x) for f, x in zip(flights, change[free:].reshape(-1, 6))]
-    return arcs, turned, C - C @ H.T @ np.linalg.solve(S, H @ C), p_values
+        changes = change[free:].reshape(-1, 6)
+        turned = [flight.moved(x) for flight, x in zip(flights, changes)]
+    taken = C @ H.T @ np.linalg.solve(S, H @ C)
+    return arcs, turned, C - taken, p_values
 
 
 def _apart(
@@ -129,19 +137,22 @@ def _apart(
     """
     impacts = len(flights) - 1
     apart = np.zeros(3 * impacts)
-    H = np.zeros((3 * impacts, free + 6 * len(flights)))
+    values = free + 6 * len(flights)
+    H = np.zeros((3 * impacts, values))
     columns = arcs.rows_of_instants()
     for i, instant in enumerate(arcs.instants_of_impacts + zero):
         rows = slice(3 * i, 3 * i + 3)
         own = free + 6 * i
-        before, after = (
-            flight.at(np.array([instant])) for flight in flights[i : i + 2]
-        )
-        between = before.turn[0].inv() * after.turn[0]
+        of_earlier = slice(own, own + 6)
+        of_later = slice(own + 6, own + 12)
+        at_instant = np.array([instant])
+        earlier = flights[i].at(at_instant)
+        later = flights[i + 1].at(at_instant)
+        between = earlier.turn[0].inv() * later.turn[0]
         apart[rows] = between.as_rotvec()
-        H[rows, own : own + 6] = -between.as_matrix().T @ before.turn_slopes[0]
-        H[rows, own + 6 : own + 12] = after.turn_slopes[0]
-        H[rows, columns[i]] = after.omega[0] - before.omega[0]
+        H[rows, of_earlier] = -between.as_matrix().T @ earlier.turn_slopes[0]
+        H[rows, of_later] = later.turn_slopes[0]
+        H[rows, columns[i]] = later.omega[0] - earlier.omega[0]
     return apart, H
 
 
@@ -161,7 +172,8 @@ def _with_velocities(
     by_column = gain.swapaxes(2, 3)
     of_places = place_of(by_column)  # views of it
     of_turns = turning_of(by_column)
-    of_places[:, :, :free] = arcs.gain_with_places().swapaxes(2, 3)
+    with_places = arcs.gain_with_places()
+    of_places[:, :, :free] = with_places.swapaxes(2, 3)
     rows = arcs.rows_of_instants()
     times = arcs.instants_of_impacts + track.t.mean()
     poses = []
@@ -170,16 +182,19 @@ def _with_velocities(
         for side in (0, 1):
             flight = flights[k + side]
             first = free + 6 * (k + side)
-            at = flight.at(np.array([instant]))
-            omegas[k, side] = at.omega[0]
+            there = flight.at(np.array([instant]))
+            omega = there.omega[0]
+            turn_slopes = there.turn_slopes[0]
+            omegas[k, side] = omega
             values = slice(first, first + 6)
-            of_turns[k, side, values] = at.omega_slopes[0].T
-            of_turns[k, side, rows[k]] = flight.rate(at.omega[0])
+            of_turns[k, side, values] = there.omega_slopes[0].T
+            of_turns[k, side, rows[k]] = flight.rate(omega)
             if side == 0:
-                of_turns[k, -1, values] = at.turn_slopes[0].T
-                of_turns[k, -1, rows[k]] = at.omega[0]
-                quaternion = at.turn[0].as_quat(scalar_first=True)
-                poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
+                of_turns[k, -1, values] = turn_slopes.T
+                of_turns[k, -1, rows[k]] = omega
+                quaternion = there.turn[0].as_quat(scalar_first=True)
+                place = arcs.places[k + 1]
+                poses.append(np.concatenate([place, quaternion]))
     flat = gain.reshape(18 * impacts, len(covariance))
     with_poses = flat @ covariance @ flat.T
     numbers = np.arange(18 * impacts).reshape(impacts, 3, 6)
@@ -188,12 +203,15 @@ def _with_velocities(
     found = []
     for k, (instant, pose) in enumerate(zip(times, poses)):
         own = slice(12 * k, 12 * (k + 1))
-        pre, post = (np.append(v[k], w) for v, w in zip((before, after), omegas[k]))
-        error = float(np.sqrt(covariance[rows[k], rows[k]]))
+        omega_before, omega_after = omegas[k]
+        pre = np.append(before[k], omega_before)
+        post = np.append(after[k], omega_after)
+        row = rows[k]
+        error = float(np.sqrt(covariance[row, row]))
         doubt = track.impacts[k].doubtful
-        found.append(
-            TrackImpact(float(instant), error, pose, pre, post, whole[own, own], doubt)
-        )
+        of_impact = whole[own, own]
+        impact = TrackImpact(float(instant), error, pose, pre, post, of_impact, doubt)
+        found.append(impact)
     return replace(
         track,
         impacts=tuple(found),

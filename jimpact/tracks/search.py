@@ -91,7 +91,8 @@ class Search:
         for before, after in pairwise(flights):
             between = slice(before[-1] + 1, after[0])
             lost = int(self.frames.seen[between].sum())
-            lasting = self.frames.t[after[0]] - self.frames.t[before[-1]]
+            t = self.frames.t
+            lasting = t[after[0]] - t[before[-1]]
             if lost >= self.settings.shortest and lasting > contact:
                 return True
         return False
@@ -107,17 +108,22 @@ class Search:
         errors = self.verdict.errors
         given = np.maximum(errors.sigma, least)
         same = (np.abs(given - used) <= AGREEING * used).all()
-        longest = max(np.ptp(self.frames.t[some]) for some in self.verdict.flights)
-        bend = np.abs(flight.acceleration - self.flight.acceleration) * longest**2 / 8
+        durations = [np.ptp(self.frames.t[rows]) for rows in self.verdict.flights]
+        longest = max(durations)
+        change = np.abs(flight.acceleration - self.flight.acceleration)
+        bend = change * longest**2 / 8
         bend[self.verdict.bent.all(axis=0)] = 0.0
-        largest = [max([w.size for w in some], default=0.0) for some in errors.waves]
+        sizes = ([wave.size for wave in waves] for waves in errors.waves)
+        largest = [max(of_coordinate, default=0.0) for of_coordinate in sizes]
         unseen = np.maximum(used, AGREEING * np.array(largest))
         if self.frames.seen.any():
             speed = np.ptp(self.frames.q[self.frames.seen], axis=0)
         else:
             speed = 0.0
-        slowing = abs(flight.drag - self.flight.drag) * np.max(speed) ** 2 / 8
-        return bool(same and (bend < unseen).all() and slowing < used.max())
+        change_of_drag = abs(flight.drag - self.flight.drag)
+        slowing = change_of_drag * np.max(speed) ** 2 / 8
+        unbent = (bend < unseen).all()
+        return bool(same and unbent and slowing < used.max())
 
 
 def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
@@ -140,7 +146,8 @@ def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
 
 def _stride(frames: Frames, shortest: int) -> int:
     """Number of frames from one to the next of the five of a window."""
-    return min(max(1, round(len(frames.t) / MOST_STRIDES)), shortest)
+    stride = round(len(frames.t) / MOST_STRIDES)
+    return min(max(1, stride), shortest)
 
 
 def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
@@ -157,14 +164,18 @@ def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
     if windows < 1:
         return 0.0
     rows = np.arange(windows)[:, None] + stride * np.arange(5)
-    since = t[rows] - t[rows].mean(axis=1, keepdims=True)
+    times = t[rows]
+    since = times - times.mean(axis=1, keepdims=True)
+    size = (since**2).sum(axis=1)
     curve = since**2 / 2
     curve = curve - curve.mean(axis=1, keepdims=True)
-    slope = (curve * since).sum(axis=1) / (since**2).sum(axis=1)
+    slope = (curve * since).sum(axis=1) / size
     curve = curve - slope[:, None] * since
-    found = (curve * x[rows]).sum(axis=1) / (curve**2).sum(axis=1)
-    rest = x[rows] - x[rows].mean(axis=1, keepdims=True)
-    rate = (rest * since).sum(axis=1) / (since**2).sum(axis=1)
+    places = x[rows]
+    along = (curve * places).sum(axis=1)
+    found = along / (curve**2).sum(axis=1)
+    rest = places - places.mean(axis=1, keepdims=True)
+    rate = (rest * since).sum(axis=1) / size
     rest = rest - rate[:, None] * since - found[:, None] * curve
     square = (rest**2).sum(axis=1)
     return median(found[square <= np.quantile(square, BEST_WINDOWS)])
@@ -199,9 +210,8 @@ def _agreed(
     """Rounds of the search until they agree, or come back to what an earlier one used;
     frames are divided by `least` sigma (n,) or more.
     """
-    search = _divided(
-        frames.with_sigma(np.maximum(frames.sigma, least)), flight, settings
-    )
+    sigma = np.maximum(frames.sigma, least)
+    search = _divided(frames.with_sigma(sigma), flight, settings)
     earlier: list[np.ndarray] = []
     for _ in range(ROUNDS):
         fitted = flight.fitted_to(search.frames, search.verdict.flights)
@@ -233,9 +243,8 @@ def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
         )
     free = free_flights(straight, flight.known_acceleration, flights)
     verdict = judged(straight, free, flight, settings.estimated)
-    verdict = verdict.of_flights(
-        [np.ptp(frames.t[f]) > settings.contact for f in verdict.flights]
-    )
+    durations = [np.ptp(frames.t[rows]) for rows in verdict.flights]
+    verdict = verdict.of_flights([x > settings.contact for x in durations])
     return Search(frames, flight, settings, flights, verdict)
 
 
@@ -251,7 +260,8 @@ def _likely_cause(frames: Frames, flight: Flight, shortest: int) -> str:
     given = float(flight.acceleration[axis])
     if step >= 1 and step == round(step):
         return f"are the steps of t, {step:g} s, numbers of frames?"
-    seen = curvature(frames.t, frames.q[:, axis], _stride(frames, shortest))
+    stride = _stride(frames, shortest)
+    seen = curvature(frames.t, frames.q[:, axis], stride)
     if given == 0 or seen == 0:
         return "are these the units of q and t?"
     ratio = seen / given
@@ -275,7 +285,8 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     """
     verdict = search.verdict
     contact = search.settings.contact
-    flight = verdict.flight.without_common(np.all(verdict.bent, axis=0))
+    by_all = np.all(verdict.bent, axis=0)
+    flight = verdict.flight.without_common(by_all)
     start = Start(verdict.flights, flight, verdict.errors, verdict.bent, contact)
     moving = False
     while True:
@@ -291,22 +302,21 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
         if joined is None:
             break
         start = joined
-    if len(start.flights) < len(verdict.flights) and verdict.errors.number_of_waves:
+    fewer = len(start.flights) < len(verdict.flights)
+    if fewer and verdict.errors.number_of_waves:
         start = with_likely_errors(search, start)
         arcs = _arcs(search.frames, start)
     sigma = of_residuals(arcs, search.frames)
     given = start.errors.sigma
-    larger = of_most_flights(arcs) > given * (
-        1 + BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs))
-    )
+    error = BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs))
+    larger = of_most_flights(arcs) > given * (1 + error)
     if search.settings.estimated or larger.any():
         if not search.settings.estimated:
             sigma = np.where(larger, sigma, given)
         frames, clock = with_clock(arcs, search.frames)
         errors = replace(start.errors, sigma=sigma, clock=clock)
-        again = replace(
-            start, errors=errors, flight=arcs.flight, instants=arcs.instants_of_impacts
-        )
+        instants = arcs.instants_of_impacts
+        again = replace(start, errors=errors, flight=arcs.flight, instants=instants)
         arcs = _arcs(frames, again)
     return arcs, start.flights
 
@@ -315,8 +325,9 @@ def with_likely_errors(search: Search, start: Start) -> Start:
     """The start with the most likely errors, model and bends of its flights."""
     straight = search.straight
     speeds = straight.speeds(start.flights)
+    estimated = search.settings.estimated
     errors, flight, bent = likely_errors(
-        straight, start.flights, start.flight, search.settings.estimated, speeds
+        straight, start.flights, start.flight, estimated, speeds
     )
     flight = flight.without_common(np.all(bent, axis=0))
     return replace(start, errors=errors, flight=flight, bent=bent)
@@ -340,17 +351,21 @@ def _without_false(search: Search, arcs: Arcs, start: Start) -> Start | None:
         if i in (0, arcs.impacts):
             continue  # the first and the last flight
         first, last = arcs.instants[i : i + 2]
-        if ((t[some] >= first) & (t[some] <= last)).sum() < enough:
+        within = (t[some] >= first) & (t[some] <= last)
+        if within.sum() < enough:
             square, joined = _joined_best(search.frames, start, i)
             without = start.without(i)
             rest = _arcs(search.frames, without).residual
             n = len(arcs.errors.sigma)
-            if np.nansum(rest**2) + price_of_lost(n) * len(some) < square:
+            left_out = price_of_lost(n) * len(some)
+            if np.nansum(rest**2) + left_out < square:
                 return without
             return joined
-    if (of_residuals(arcs, search.frames) > UNMET * arcs.errors.sigma).any():
-        sizes = [np.nanmean(arcs.residual[some] ** 2) for some in arcs.members]
-        square, joined = _joined_best(search.frames, start, int(np.argmax(sizes)))
+    unmet = of_residuals(arcs, search.frames) > UNMET * arcs.errors.sigma
+    if unmet.any():
+        sizes = [np.nanmean(arcs.residual[rows] ** 2) for rows in arcs.members]
+        worst = int(np.argmax(sizes))
+        square, joined = _joined_best(search.frames, start, worst)
         if square < np.nansum(arcs.residual**2):
             return joined
     return None
@@ -362,7 +377,8 @@ def _joined_best(frames: Frames, start: Start, flight: int) -> tuple[float, Star
     for k in (flight - 1, flight):
         if 0 <= k < len(start.flights) - 1:
             joined = start.joined_at(k)
-            tried.append((float(np.nansum(_arcs(frames, joined).residual ** 2)), k))
+            rest = _arcs(frames, joined).residual
+            tried.append((float(np.nansum(rest**2)), k))
     square, k = min(tried)
     return square, start.joined_at(k)
 
@@ -389,16 +405,19 @@ def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
     if start.contact > near * frames.step:
         return fit_arcs(frames, start)  # frames that near would lie in the contact
     white = Errors.white(start.errors.sigma)
-    model = replace(start.flight, drag_unknown=False, unknown=np.zeros_like(waves))
+    nothing = np.zeros_like(waves)
+    model = replace(start.flight, drag_unknown=False, unknown=nothing)
     bent = np.ones((2, len(waves)), bool)
     at: list[float] = []
     within: list[float] = []
     for before, after in pairwise(start.flights):
         two = [before[-near:], after[:near]]
-        local = fit_arcs(frames, Start(two, model, white, bent, start.contact))
+        start_here = Start(two, model, white, bent, start.contact)
+        local = fit_arcs(frames, start_here)
         at.extend(local.instants_of_impacts)
         within.extend(local.instant_errors())
-    known = replace(start, instants=np.array(at), instant_errors=np.array(within))
+    instants = np.array(at)
+    known = replace(start, instants=instants, instant_errors=np.array(within))
     return fit_arcs(frames, known)
 
 
@@ -414,7 +433,8 @@ def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
         first_end = i + (i == 0)
         last_end = i + 1 - (i == last)
         ends = arcs.instants[first_end : last_end + 1]
-        distance = np.abs(search.frames.t[some][:, None] - ends)
+        t = search.frames.t[some]
+        distance = np.abs(t[:, None] - ends)
         near.append(some[(distance <= window).any(axis=1)])
     if min(map(len, near)) < 3:
         raise ValueError(
@@ -440,7 +460,8 @@ def of_residuals(arcs: Arcs, frames: Frames) -> np.ndarray:
     """
     sigma = arcs.errors.sigma
     freedom = np.maximum(_freedom(arcs) - 2, 2.0)
-    scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
+    square = np.nansum(arcs.residual**2, axis=0)
+    scale = np.sqrt(square / freedom)
     found = np.maximum(sigma * scale, least_noise(frames.q))
     return np.where(arcs.errors.waving, sigma, found)
 
@@ -451,12 +472,12 @@ def of_most_flights(arcs: Arcs) -> np.ndarray:
     A body that slides between flights leaves large residuals there, but not in the
     others.
     """
-    sizes = np.array(
-        [np.nanmean(arcs.residual[some] ** 2, axis=0) for some in arcs.members]
-    )
-    counts = [len(some) for some in arcs.members]
+    squares = arcs.residual**2
+    sizes = np.array([np.nanmean(squares[rows], axis=0) for rows in arcs.members])
+    counts = [len(rows) for rows in arcs.members]
     by_frame = np.repeat(sizes, counts, axis=0)
-    return arcs.errors.sigma * np.sqrt(np.nanmedian(by_frame, axis=0))
+    middle = np.nanmedian(by_frame, axis=0)
+    return arcs.errors.sigma * np.sqrt(middle)
 
 
 def _freedom(arcs: Arcs) -> np.ndarray:
@@ -465,7 +486,8 @@ def _freedom(arcs: Arcs) -> np.ndarray:
     ends = len(arcs.instants)
     seen = np.isfinite(arcs.residual).sum(axis=0)
     own = arcs.bent.sum(axis=0) + arcs.flight.unknown
-    return np.maximum(seen - ends - (ends - 2) / n - own, 1.0)
+    of_instants = (ends - 2) / n
+    return np.maximum(seen - ends - of_instants - own, 1.0)
 
 
 def doubts(search: Search, arcs: Arcs) -> np.ndarray:

@@ -193,7 +193,8 @@ def _of_capture(
         )
     _check_rising(path, "the times", t)
     if capture.format != "Qualisys TSV":
-        for marker in dict.fromkeys(str(name).rpartition(" ")[0] for name in names):
+        markers = (str(name).rpartition(" ")[0] for name in names)
+        for marker in dict.fromkeys(markers):
             _check_seen(path, capture, marker)
     scale = [UNITS[own] if k in lengths else 1.0 for k in range(len(found))]
     return t, q * scale
@@ -201,10 +202,10 @@ def _of_capture(
 
 def _check_seen(path: str | Path, capture: Capture, marker: str) -> None:
     """Raise where a marker lies at exactly 0 at an end, see `check_not_zero`."""
-    whole = next(
-        x for x in capture.axes if x == marker or x.rpartition(":")[-1] == marker
-    )
-    places = [k for k, axis in enumerate(capture.axes[whole]) if axis not in TURN]
+    whole = capture.full_name(marker)
+    assert whole is not None  # its column has been found
+    axes = capture.axes[whole]
+    places = [k for k, axis in enumerate(axes) if axis not in TURN]
     check_not_zero(path, marker, capture.values[whole][:, places])
 
 
@@ -287,17 +288,18 @@ def _table(
             header: list[str] = []
             places = [int(name) for name in wanted]
         else:
-            start, separator, header = _header(
-                path, first, [str(x) for x in wanted], decimal
-            )
+            texts = [str(x) for x in wanted]
+            start, separator, header = _header(path, first, texts, decimal)
             places = [_place(path, header, str(name)) for name in wanted]
         count = len(names) + len(of_rows)
-        columns = _Columns(path, places[:count], [str(x) for x in wanted], decimal)
+        texts = [str(x) for x in wanted]
+        columns = _Columns(path, places[:count], texts, decimal)
         choice = _Choice.of(rows.where or {}, places[count:])
         frames = _frames_beside(header)
         if rows.frame is not None:
             frames = []
-        body = _body(chain(first[start:], file), start + 1, separator, not of_rows)
+        lines = chain(first[start:], file)
+        body = _body(lines, start + 1, separator, not of_rows)
         units, body = _line_of_units(body)
         for k, cells in body:
             _check_width(path, k, cells, header)
@@ -315,7 +317,8 @@ def _table(
         order = values[:, -1]
     beside = None
     if frames:
-        beside = (frames[0].name, np.array(frames[0].numbers))
+        number = frames[0]
+        beside = (number.name, np.array(number.numbers))
     below = [_cell(units, place) for place in places]
     return _Table(values[:, : len(names)], below, order, beside)
 
@@ -380,13 +383,10 @@ class _Choice:
     def of(cls, where: Mapping[Name, Any], places: list[int]) -> "_Choice":
         """The choice before the first row."""
         names = list(where)
-        return cls(
-            names,
-            places,
-            list(where.values()),
-            [0] * len(names),
-            [set() for _ in names],
-        )
+        none = [0] * len(names)
+        others: list[set[str]] = [set() for _ in names]
+        values = list(where.values())
+        return cls(names, places, values, none, others)
 
     def takes(self, cells: list[str]) -> bool:
         """True for a row that holds all values."""
@@ -443,7 +443,8 @@ class _Columns:
 
     def values(self) -> np.ndarray:
         """The numbers (T, n)."""
-        return np.array(self.numbers).reshape(-1, len(self.places))
+        columns = len(self.places)
+        return np.array(self.numbers).reshape(-1, columns)
 
 
 @dataclass
@@ -513,7 +514,8 @@ def _times(
     if rate is None:
         assert table.order is not None
         _check_times(path, str(time), table.order)
-        return table.order * _seconds(str(time), table.units[table.values.shape[1]])
+        unit = table.units[table.values.shape[1]]
+        return table.order * _seconds(str(time), unit)
     if table.beside is not None:
         _check_lines_are_frames(path, *table.beside)
     return np.arange(len(table.values)) / rate
@@ -548,7 +550,8 @@ def _check_times(path: str | Path, name: str, t: np.ndarray) -> None:
         raise ValueError(
             f"{path}: column `{name}` must have a time in each row, but not in {k + 1}."
         )
-    steady = len(t) > 2 and np.ptp(t) < ALIKE * t.mean() and t.min() > 0
+    alike = np.ptp(t) < ALIKE * t.mean()
+    steady = len(t) > 2 and alike and t.min() > 0
     if steady and not (np.diff(t) > 0).all():
         raise ValueError(
             f"{path}: column `{name}` holds steps between frames, about "
@@ -591,7 +594,8 @@ def _units(unit: str | Sequence[str] | None, names: Sequence[Name]) -> list[str]
             units = [unit] * len(names)
         else:
             units = list(unit)
-    if len(units) != len(names) or not all(each in UNITS for each in units):
+    known = all(of_column in UNITS for of_column in units)
+    if len(units) != len(names) or not known:
         raise ValueError(
             f"Argument `unit` must be one of {', '.join(UNITS)}, or one for each of "
             f"{len(names)} columns, but has value {short_repr(unit)}. Pixels are no "
@@ -642,7 +646,8 @@ def _cells(line: str, separator: str | None) -> list[str]:
         parts = line.split()
     else:
         parts = split_cells(line.rstrip("\n"), separator)
-    return [part.strip().strip('"').strip() for part in parts]
+    bare = (part.strip().strip('"') for part in parts)
+    return [part.strip() for part in bare]
 
 
 def _without_names(

@@ -51,7 +51,9 @@ class Turning:
         """
         if self.inertia is None:
             return np.zeros(3)
-        return -np.linalg.solve(self.inertia, np.cross(omega, self.inertia @ omega))
+        momentum = self.inertia @ omega
+        moment = np.cross(omega, momentum)
+        return -np.linalg.solve(self.inertia, moment)
 
     def at(self, times: np.ndarray) -> "TurningAt":
         """Orientations and angular velocities at times (F,) [s], and their derivatives.
@@ -59,17 +61,19 @@ class Turning:
         By difference quotients: free rotations from here, and from six starts moved by
         SMALL.
         """
-        starts = [self, *(self.moved(step) for step in SMALL * np.eye(6))]
+        steps = SMALL * np.eye(6)
+        starts = [self, *map(self.moved, steps)]
         turns = Rotation.concatenate([x.turn for x in starts])
-        each = np.stack([x.omega for x in starts])
-        rotations = free_rotation(turns, each, times - self.middle, self.inertia)
+        omegas = np.stack([x.omega for x in starts])
+        rotations = free_rotation(turns, omegas, times - self.middle, self.inertia)
         turn, *moved_turns = rotations[0]
         omega, *moved_omegas = rotations[-1]
-        turning = [(turn.inv() * x).as_rotvec() / SMALL for x in moved_turns]
+        back = turn.inv()
+        turning = [(back * x).as_rotvec() / SMALL for x in moved_turns]
         changes = [(x - omega) / SMALL for x in moved_omegas]
-        return TurningAt(
-            turn, omega, np.stack(turning, axis=2), np.stack(changes, axis=2)
-        )
+        turn_slopes = np.stack(turning, axis=2)
+        omega_slopes = np.stack(changes, axis=2)
+        return TurningAt(turn, omega, turn_slopes, omega_slopes)
 
 
 class TurningAt(NamedTuple):
@@ -93,10 +97,11 @@ def free_rotation(
     the axes of the body, at rising times `since` (F,) [s] after the start.
     """
     if inertia is None:  # omega stays
-        paths = [
-            r * Rotation.from_rotvec(since[:, None] * w) for r, w in zip(turns, omegas)
-        ]
-        return paths, np.tile(omegas[:, None], (1, len(since), 1))
+        angles = (since[:, None] * omega for omega in omegas)
+        turned = map(Rotation.from_rotvec, angles)
+        paths = [turn * change for turn, change in zip(turns, turned)]
+        constant = np.tile(omegas[:, None], (1, len(since), 1))
+        return paths, constant
     count = len(omegas)
     inverse = np.linalg.inv(inertia)
 
@@ -104,22 +109,25 @@ def free_rotation(
         """Rates of B states: three rows of R, whose rates are `row x omega`, and
         omega.
         """
-        rows, w = np.split(state.reshape(count, 4, 3), [3], axis=1)
+        of_starts = state.reshape(count, 4, 3)
+        rows, w = np.split(of_starts, [3], axis=1)
         slope = -np.cross(w, w @ inertia) @ inverse  # both are symmetric
-        return np.concatenate([np.cross(rows, w), slope], axis=1).ravel()
+        changes = np.concatenate([np.cross(rows, w), slope], axis=1)
+        return changes.ravel()
 
-    start = np.concatenate([turns.as_matrix(), omegas[:, None]], axis=1).ravel()
+    with_omega = np.concatenate([turns.as_matrix(), omegas[:, None]], axis=1)
+    start = with_omega.ravel()
     states = np.tile(start, (len(since), 1))
     for way in (-1, 1):  # backwards, then forwards in time
         some = np.flatnonzero(way * since > 0)
         if some.size:
             outwards = some[::way]
             span = (0.0, since[outwards[-1]])
-            path = solve_ivp(
-                rates, span, start, "DOP853", since[outwards], rtol=RTOL, atol=RTOL
-            )
+            times = since[outwards]
+            path = solve_ivp(rates, span, start, "DOP853", times, rtol=RTOL, atol=RTOL)
             states[outwards] = path.y.T
-    states = states.reshape(len(since), count, 4, 3).swapaxes(0, 1)
+    by_time = states.reshape(len(since), count, 4, 3)
+    states = by_time.swapaxes(0, 1)
     matrices, omega = np.split(states, [3], axis=2)
     return [Rotation.from_matrix(x) for x in matrices], omega[:, :, 0]
 
@@ -142,20 +150,24 @@ def fit_turning(
     middle = float(t.mean())
     nearest = len(t) // 2
     earlier, later = neighbours(measured)
-    rates = (earlier.inv() * later).as_rotvec() / np.diff(t)[:, None]
+    turned_by = (earlier.inv() * later).as_rotvec()
+    rates = turned_by / np.diff(t)[:, None]
     omega = np.median(rates, axis=0)
     flight = Turning(middle, measured[nearest], omega, np.eye(6), inertia)
     turn_to_middle = (middle - t[nearest]) * omega
     flight = flight.moved(np.append(turn_to_middle, np.zeros(3)))
     for _ in range(STEPS):
         fitted = flight.at(t)
-        rest = (fitted.turn.inv() * measured).as_rotvec()
-        J = (fitted.turn_slopes / sigma[:, None]).reshape(-1, 6)
-        step = np.linalg.lstsq(J, (rest / sigma).ravel(), rcond=None)[0]
+        off = fitted.turn.inv() * measured
+        rest = off.as_rotvec() / sigma
+        slopes = fitted.turn_slopes / sigma[:, None]
+        J = slopes.reshape(-1, 6)
+        step, *_ = np.linalg.lstsq(J, rest.ravel(), rcond=None)
         flight = flight.moved(step)
         turned, _ = np.split(step, 2)
         if np.abs(turned).max() < SETTLED:
             break
     covariance = np.linalg.pinv(J.T @ J, hermitian=True)
-    rest = (flight.at(t).turn.inv() * measured).as_rotvec()
+    off = flight.at(t).turn.inv() * measured
+    rest = off.as_rotvec()
     return Turning(middle, flight.turn, flight.omega, covariance, inertia), rest

@@ -79,7 +79,9 @@ class Errors:
         """Velocities (n,) of the waves of each coordinate, root mean square: each
         wave's is `w / T`.
         """
-        squares = [sum((w.size / w.time) ** 2 for w in some) for some in self.waves]
+        squares = [
+            sum((wave.size / wave.time) ** 2 for wave in waves) for waves in self.waves
+        ]
         return np.sqrt(np.array(squares, float))
 
     @property
@@ -99,7 +101,8 @@ class Errors:
 
         `relative` (N,): white errors of these frames in sigma; None: 1.
         """
-        return Covariance(Flights(t, starts), self.sigma[c], self.waves[c], relative)
+        flights = Flights(t, starts)
+        return Covariance(flights, self.sigma[c], self.waves[c], relative)
 
 
 @dataclass(frozen=True)
@@ -151,12 +154,14 @@ class Covariance:
         if not self.waves:
             return weights * x / self.sigma**2
         count = len(self.waves)
-        sides = np.zeros((len(x), count, 2, x.shape[1]))
+        columns = x.shape[1]
+        sides = np.zeros((len(x), count, 2, columns))
         sides[:, :, 0] = (weights * x)[:, None]
-        flat = sides.reshape(-1, x.shape[1])
+        flat = sides.reshape(-1, columns)
         found = cho_solve_banded((self._factor, False), flat, check_finite=False)
         places = found.reshape(sides.shape)[:, :, 0]
-        return weights * (x - places.sum(axis=1)) / self.sigma**2
+        rest = x - places.sum(axis=1)
+        return weights * rest / self.sigma**2
 
     def log_det(self) -> np.ndarray:
         """`log |C|` (F,) of each flight.
@@ -167,8 +172,10 @@ class Covariance:
         found = 2 * np.log(self.sigma) - np.log(self.weights)
         if self.waves:
             for wave, steps in zip(self.waves, self._steps):
-                found = found + 4 * np.log(wave.size / self.sigma) + steps.log_det
-            pivots = np.log(self._factor[-1]).reshape(len(found), -1)
+                size = wave.size / self.sigma
+                found = found + 4 * np.log(size) + steps.log_det
+            diagonal = np.log(self._factor[-1])
+            pivots = diagonal.reshape(len(found), -1)
             found = found + 2 * pivots.sum(axis=1)
         return np.add.reduceat(found, self.flights.starts)
 
@@ -185,9 +192,12 @@ class Covariance:
         adds the f_j of a frame, u are its weights.
         """
         rows = 2 * len(self.waves)  # of a frame
-        bands = np.zeros((rows + 2, rows * len(self.flights.t)))
-        for j, (wave, steps) in enumerate(zip(self.waves, self._steps)):
-            steps.add_to(bands, 2 * j, rows, (self.sigma / wave.size) ** 2)
+        frames = len(self.flights.t)
+        bands = np.zeros((rows + 2, rows * frames))
+        waves = zip(self.waves, self._steps)
+        for j, (wave, steps) in enumerate(waves):
+            share = self.sigma / wave.size
+            steps.add_to(bands, 2 * j, rows, share**2)
         # f_i with f_j of the same frame
         for j in range(0, rows, 2):
             for i in range(0, j + 2, 2):
@@ -261,14 +271,17 @@ def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
     own_fg = w_fg.copy()
     own_gg = w_gg.copy()
     # A^T W A of the step that follows
-    following = slice(1, None)
-    own_ff[:-1] -= (a_ff * m_ff + a_gf * m_gf)[following]
-    own_fg[:-1] -= (a_ff * m_fg + a_gf * m_gg)[following]
-    own_gg[:-1] -= (a_fg * m_fg + a_gg * m_gg)[following]
+    rest_ff = a_ff * m_ff + a_gf * m_gf
+    rest_fg = a_ff * m_fg + a_gf * m_gg
+    rest_gg = a_fg * m_fg + a_gg * m_gg
+    own_ff[:-1] -= rest_ff[1:]
+    own_fg[:-1] -= rest_fg[1:]
+    own_gg[:-1] -= rest_gg[1:]
     of_frame = np.column_stack([own_ff, own_fg, own_gg])
     with_next = np.zeros((len(t), 4))
     # the rows of m are those of the next frame
-    with_next[:-1] = np.column_stack([m_ff, m_gf, m_fg, m_gg])[following]
+    of_next = np.column_stack([m_ff, m_gf, m_fg, m_gg])
+    with_next[:-1] = of_next[1:]
     return Steps(of_frame, with_next, np.log(det))
 
 
@@ -276,7 +289,9 @@ def _free(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`exp(-b z) sin(c z) / c` and `exp(-b z) cos(c z)` of steps z of a free
     oscillator."""
     decay = np.exp(-DAMPING * z)
-    return decay * np.sin(FREQUENCY * z) / FREQUENCY, decay * np.cos(FREQUENCY * z)
+    angle = FREQUENCY * z
+    sine = decay * np.sin(angle) / FREQUENCY
+    return sine, decay * np.cos(angle)
 
 
 def _noise(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -290,9 +305,12 @@ def _noise(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     down = still - DAMPING * h
     far = z > SHORT
     near = np.minimum(z, SHORT)
-    ff = np.where(far, 1 - up**2 - h**2, near**3 * _PLACES(near))
-    gg = np.where(far, 1 - down**2 - h**2, near * _RATES(near))
-    return ff, 2 * DAMPING * h**2, gg
+    ff_near = near**3 * _PLACES(near)
+    gg_near = near * _RATES(near)
+    ff = np.where(far, 1 - up**2 - h**2, ff_near)
+    gg = np.where(far, 1 - down**2 - h**2, gg_near)
+    fg = 2 * DAMPING * h**2
+    return ff, fg, gg
 
 
 def _integrals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -303,7 +321,9 @@ def _integrals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     h, still = _free(z[:, None] * share)
     rate = still - DAMPING * h
     scale = 2 * DAMPING * weights
-    return (scale * h**2).sum(axis=1) / z**2, (scale * rate**2).sum(axis=1)
+    of_places = (scale * h**2).sum(axis=1)
+    of_rates = (scale * rate**2).sum(axis=1)
+    return of_places / z**2, of_rates
 
 
 _PLACES = Chebyshev.interpolate(lambda z: _integrals(z)[0], DEGREE, (0.0, SHORT))
