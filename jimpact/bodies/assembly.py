@@ -152,13 +152,8 @@ class Bodies(RigidBodies):
         """Check the arguments, stack the arrays of all bodies, and choose the pairs or
         the grid.
         """
-        for name, some in (("bodies", bodies), ("fixed", fixed)):
-            if not np.iterable(some):
-                raise TypeError(
-                    f"Argument `{name}` must be a list of bodies, but is {some!r}."
-                )
-        bodies = tuple(bodies)
-        fixed = tuple(fixed)
+        bodies = _as_list("bodies", bodies)
+        fixed = _as_list("fixed", fixed)
         every = (*bodies, *fixed)
         if not bodies:
             raise ValueError("Argument `bodies` must hold one or more, but is empty.")
@@ -520,6 +515,15 @@ def _active_pairs(
     """The contacts with gaps up to `below` () [m] at q, and the least gap () [m]."""
     closed = bodies.active_pairs(q, q, below)
     return closed, bodies.least_gap(q)
+
+
+def _as_list(name: str, bodies: Any) -> tuple[Any, ...]:
+    """The bodies of an argument; a TypeError for what is no list."""
+    if not np.iterable(bodies):
+        raise TypeError(
+            f"Argument `{name}` must be a list of bodies, but is {bodies!r}."
+        )
+    return tuple(bodies)
 
 
 def _check_places(places: jax.Array, fixed: int, d: int) -> None:

@@ -438,16 +438,9 @@ class SlipFlow(FrictionFlow):
         changes = dot(perpendicular, acceleration(df, dside))
         # J = n K_tt n c + diag(r'), all in units of the largest entry: forces begin at
         # 0
-        blocks = self._blocks(const)
-        j = sum(
-            perpendicular[:, i][:, None]
-            * blocks[:, i, :, k]
-            * perpendicular[:, k][None]
-            for i in range(2)
-            for k in range(2)
-        )
         both_creep = creeps[:, None] & creeps[None]
-        j = jnp.where(both_creep, j * c[None], 0.0)
+        n_k_n = self._across(const, perpendicular)
+        j = jnp.where(both_creep, n_k_n * c[None], 0.0)
         rows = jnp.max(jnp.abs(j), axis=1)
         size = largest_of(rows + jnp.abs(grows))
         size = jnp.where(size > 0, size, 1.0)
@@ -467,6 +460,21 @@ class SlipFlow(FrictionFlow):
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         drift_of_creep = jnp.where(creeps, drift, 0.0)
         return drift_of_creep, jnp.where(creeps, correction, 0.0)
+
+    def _across(
+        self, const: Reduced, perpendicular: Float[Array, "m 2 B"]
+    ) -> Float[Array, "m m B"]:
+        """`n_i . K_tt,ij n_j` of all pairs of contacts, n the `perpendicular`."""
+        blocks = self._blocks(const)
+        components = [
+            perpendicular[:, i][:, None]
+            * blocks[:, i, :, k]
+            * perpendicular[:, k][None]
+            for i in range(2)
+            for k in range(2)
+        ]
+        total: Any = sum(components)
+        return total
 
     def contact_states(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]

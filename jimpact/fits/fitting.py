@@ -304,22 +304,9 @@ def fit_many(
     as_whole("starts", starts, 1)
     as_workers(workers)
     check_kind("many", many, Sequence)
-    choice = (free, bounds, priors, ties)
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
-    first = of_shots(law, scene, many[0], *choice)
-    # problems of other shots follow from the first one, but where more depends on the
-    # data: scenes, errors of v-, and the coarse tolerance that their noise allows
-    follow = scene is not None and first.before is None
-    follow &= getattr(first.law, "rtol", None) != COARSE_RTOL
-    problems = [first]
-    for data in many[1:]:
-        only_shots = follow and data.scenes is None and data.sigma_pre is None
-        if only_shots:
-            other = first.of_other(data, scene)
-        else:
-            other = of_shots(law, scene, data, *choice)
-        problems.append(other)
+    problems = _problems(law, scene, many, (free, bounds, priors, ties))
     each: dict[int, Ends] = {}  # of the starts of a data set
     with progress_bar(progress) as show:
         for members in _alike(problems):
@@ -354,6 +341,28 @@ def fit_many(
     squares = np.array([end.squares for end in best])
     converged = np.array([end.converged for end in best])
     return Fits(problems[0].names, value, squares, converged, made)
+
+
+def _problems(
+    law: Any, scene: Scene | None, many: Sequence[Experiments], choice: tuple[Any, ...]
+) -> list[FitProblem]:
+    """Problems of many data sets, `choice` what of the law is free, and how.
+
+    Those of other shots follow from the first one, but where more depends on the data:
+    scenes, errors of v-, and the coarse tolerance that their noise allows.
+    """
+    first = of_shots(law, scene, many[0], *choice)
+    coarse = getattr(first.law, "rtol", None) == COARSE_RTOL
+    follow = scene is not None and first.before is None and not coarse
+    problems = [first]
+    for data in many[1:]:
+        only_shots = data.scenes is None and data.sigma_pre is None
+        if follow and only_shots:
+            other = first.of_other(data, scene)
+        else:
+            other = of_shots(law, scene, data, *choice)
+        problems.append(other)
+    return problems
 
 
 def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:

@@ -92,37 +92,28 @@ def law_at_shots(
     used = jnp.asarray(measurement.weight) > 0
     error_before = jnp.asarray(before.standard_errors(measured.shape))
     n = observe.bodies
-
-    def outcome(
-        moved: Float[Array, " X+n"], pre: Float[Array, "K n"]
-    ) -> tuple[Any, Prediction]:
-        """v+ at (parameters, change of all v- from `pre`), to be differentiated, and as
-        it is.
-        """
-        parameters = moved[:-n]
-        velocities = jnp.asarray(observe.pre).at[:, :n].set(pre + moved[None, -n:])
-        prediction = eqx.tree_at(lambda shots: shots.pre, observe, velocities)(
-            law_of(parameters)
-        )
-        return prediction.value, prediction
+    outcome = partial(_outcome, law_of, observe)
 
     def at(pre: Float[Array, "K n"]) -> tuple[LawAtShots, Float[Array, "K n"]]:
         """The law linearized at true velocities, and the true velocities that
         follow.
         """
         start = jnp.concatenate([x, jnp.zeros(n, x.dtype)])
-        slopes, prediction = jax.jacfwd(partial(outcome, pre=pre), has_aux=True)(start)
+        slopes_at = jax.jacfwd(partial(outcome, pre), has_aux=True)
+        slopes, prediction = slopes_at(start)
         identity = jnp.eye(n, dtype=x.dtype)[None]
-        by_velocities = jnp.where(prediction.bad[..., None], identity, slopes[..., -n:])
+        bad = prediction.bad
+        by_velocities = jnp.where(bad[..., None], identity, slopes[..., -n:])
         by_parameters = slopes[..., :-n]
         shift = jnp.einsum("kij,kj->ki", by_velocities, measured - pre)
         at_measured = prediction._replace(value=prediction.value + shift)
         error = measurement.error(at_measured)
         whitener = before.whitener(by_velocities, used)
-        counts = used & ~jnp.broadcast_to(prediction.bad, used.shape)
+        counts = used & ~jnp.broadcast_to(bad, used.shape)
         slope_of_error = jnp.where(counts[..., None], by_parameters, 0.0)
         independent = jax.vmap(whitener.independent, in_axes=-1, out_axes=-1)
-        estimate = jnp.where(prediction.bad, pre, measured + whitener.shift(error))
+        agreeing = measured + whitener.shift(error)
+        estimate = jnp.where(bad, pre, agreeing)
         law = LawAtShots(
             pre=pre,
             predicted=at_measured.value,
@@ -151,7 +142,26 @@ def law_at_shots(
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     unknown = nothing._replace(moved=jnp.asarray(jnp.inf, x.dtype))
     first = _Iteration(jnp.asarray(0), measured, unknown)
-    return jax.lax.while_loop(goes_on, step, first).law
+    last = jax.lax.while_loop(goes_on, step, first)
+    return last.law
+
+
+def _outcome(
+    law_of: Callable[[Float[Array, " X"]], Law],
+    observe: Shots,
+    pre: Float[Array, "K n"],
+    moved: Float[Array, " X+n"],
+) -> tuple[Any, Prediction]:
+    """v+ at (parameters, change of all v- from `pre`), to be differentiated, and as it
+    is.
+    """
+    n = observe.bodies
+    parameters = moved[:-n]
+    change = moved[None, -n:]
+    velocities = jnp.asarray(observe.pre).at[:, :n].set(pre + change)
+    shots = eqx.tree_at(lambda shots: shots.pre, observe, velocities)
+    prediction = shots(law_of(parameters))
+    return prediction.value, prediction
 
 
 def _largest(

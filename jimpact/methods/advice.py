@@ -279,67 +279,76 @@ def _simplest_law(
     gaps count or contacts re-close, else LZB.
     """
     v = situation.velocity
-    each = {
+    programs = {
         name: partial(_outcomes, law, v, progress=progress)
         for name, law in laws.items()
     }
-    outcomes, left_out = at_points(each, k)
+    outcomes, left_out = at_points(programs, k)
     for name in ("lzb", "compliant"):
         if name in left_out:
             raise RuntimeError(f"The reference law {name} {left_out[name]}")
     laws = {name: laws[name] for name in outcomes}
     apart = _reclosing_distance(situation, outcomes)  # of LZB and Compliant
-    follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
-    if follows_gaps:
+    if situation.gapped.any() or apart > tolerance / SMALL_PART:
         name = "compliant"
     else:
         name = "lzb"
     outcomes[name].check_first(f"The reference law {name} fails on this scene")
     reference = outcomes[name].where_usable()
+    costs: dict[str, Any] = {}
     if timing:
         costs = _costs(laws, v, k)
-    else:
-        costs = {}
-    candidates = {}
-    for key, law in laws.items():
-        cost = costs.get(key)
-        candidates[key] = _candidate(
-            law, situation, outcomes[key], reference, random, cost
+    candidates = {
+        key: _candidate(
+            law, situation, outcomes[key], reference, random, costs.get(key)
         )
-    usable = {key: c for key, c in candidates.items() if c.usable}
-    suffice = [key for key, c in usable.items() if c.worst <= tolerance]
-    if suffice:
-        chosen = suffice[0]
-    else:
-        chosen = name
-    options = options_of(type(laws[chosen].law))
-    if "rtol" in options and laws[chosen].rtol is not None:
+        for key, law in laws.items()
+    }
+    chosen, suffices = _simplest(candidates, tolerance, name)
+    law = laws[chosen]
+    if "rtol" in options_of(type(law.law)) and law.rtol is not None:
         candidates[chosen] = _with_coarsest_rtol(
-            candidates[chosen], laws[chosen], situation, k, reference, tolerance
+            candidates[chosen], law, situation, k, reference, tolerance
         )
-    gap_ratio = None
-    if situation.gapped.any():
-        scale = gap_scale(situation.scene, laws["compliant"].law, v)
-        gap_ratio = np.asarray(scale.ratio)[situation.gapped]
+    blocks = _with_simplest_laws(situation, candidates, outcomes, reference, tolerance)
     return Advice(
         name=chosen,
         tolerance=tolerance,
-        within=bool(suffice),
+        within=suffices,
         reference=name,
         velocity=v,
         gap_velocity=situation.gap_velocity,
         candidates=candidates,
-        blocks=_with_simplest_laws(
-            situation, candidates, outcomes, reference, tolerance
-        ),
+        blocks=blocks,
         stiffness=k[0],
         unknown=_with_effects(situation, unknown, reference, tolerance),
         rows=len(k),
-        gap_ratio=gap_ratio,
+        gap_ratio=_gap_ratio(situation, laws["compliant"].law),
         far=tuple(np.flatnonzero(situation.far).tolist()),
         reclosing=apart,
         left_out=left_out,
     )
+
+
+def _gap_ratio(situation: Situation, compliant: Law) -> np.ndarray | None:
+    """Gaps over the scale of this law, of contacts with a gap; None where none has."""
+    gapped = situation.gapped
+    if not gapped.any():
+        return None
+    scale = gap_scale(situation.scene, compliant, situation.velocity)
+    return np.asarray(scale.ratio)[gapped]
+
+
+def _simplest(
+    candidates: dict[str, Candidate], tolerance: float, reference: str
+) -> tuple[str, bool]:
+    """The first of the candidates that is usable and within the tolerance, and that
+    there is one; else the reference.
+    """
+    for name, candidate in candidates.items():
+        if candidate.usable and candidate.worst <= tolerance:
+            return name, True
+    return reference, False
 
 
 def _checked_range(

@@ -250,45 +250,32 @@ def work_precision(
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
     _check_names(laws, different)
-    programs = {
-        n: _method_programs(m, case, gradients, durations) for n, m in different.items()
-    }
+    measured = partial(_method_programs, case=case, gradients=gradients)
+    programs = {n: measured(m, durations=durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     of_methods: dict[str, Any] = {m.name: m.ladder for m in chosen}
     ladders = of_methods | dict.fromkeys(laws, (None,))
     truth = programs[exact.name].at(FINEST)
     other_truth = programs[second.name].at(SECOND)
-    settings_in_all = sum(map(len, ladders.values()))
-    with counting_bar(settings_in_all, "errors", progress) as advance:
-        climbed = {
-            name: partial(_outcomes_over_ladder, programs[name], name, advance)
-            for name in ladders
-        }
-        solutions, raised = at_points(climbed, ladders)
+    solutions, raised = _solutions(programs, ladders, progress)
     rows = [
-        (n, setting, s)
-        for n, row in solutions.items()
-        for setting, s in zip(ladders[n], row)
+        (name, *of_setting)
+        for name, row in solutions.items()
+        for of_setting in zip(ladders[name], row)
     ]
     runs = [(programs[name], setting) for name, setting, _ in rows]
     times = _times(runs, repeats, progress)
     labels = {m.name: m.label or m.name for m in chosen}
     labels |= {name: f"law: {name}" for name in laws}
     points: dict[str, list[Point]] = {name: [] for name in solutions}
-    for (name, setting, solution), timings in zip(rows, times):
-        off = _errors(case, solution, truth)
-        point = _point(labels[name], setting, off, solution, timings)
+    for (name, setting, found), timings in zip(rows, times):
+        off = _errors(case, found, truth)
+        point = _point(labels[name], setting, off, found, timings)
         points[name].append(point)
     return WorkPrecision(
         velocity=np.asarray(case.velocity),
         points={name: tuple(row) for name, row in points.items()},
-        reference=Reference(
-            how=f"{exact.name} at rtol {FINEST:g} against {second.name} at {SECOND:g}",
-            uncertainty=_errors(case, other_truth, truth),
-            velocity=np.asarray(truth.velocity[0]),
-            impulse=np.asarray(truth.impulse[0]),
-            duration=float(np.ravel(truth.duration)[0]),
-        ),
+        reference=_as_reference(exact.name, second.name, case, truth, other_truth),
         compile_time={name: programs[name].compile_time for name in points},
         left_out=left_out | raised,
         without_gradient={m.name: HOST for m in chosen if gradients and not m.jax},
@@ -296,6 +283,35 @@ def work_precision(
         sample=case.sample,
         spread=SPREAD,
         repeats=repeats,
+    )
+
+
+def _solutions(
+    programs: Mapping[str, Any], ladders: Mapping[str, Any], progress: float | None
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Solutions by name at each setting of its ladder; why others were left out."""
+    total = sum(map(len, ladders.values()))
+    with counting_bar(total, "errors", progress) as advance:
+        climbed = {
+            name: partial(_outcomes_over_ladder, programs[name], name, advance)
+            for name in ladders
+        }
+        return at_points(climbed, ladders)
+
+
+def _as_reference(
+    name: str, other_name: str, case: "Case", truth: Any, other_truth: Any
+) -> Reference:
+    """The reference solution of the impact itself, and its distance from the other
+    one, by the methods of these names.
+    """
+    duration = np.ravel(truth.duration)[0]
+    return Reference(
+        how=f"{name} at rtol {FINEST:g} against {other_name} at {SECOND:g}",
+        uncertainty=_errors(case, other_truth, truth),
+        velocity=np.asarray(truth.velocity[0]),
+        impulse=np.asarray(truth.impulse[0]),
+        duration=float(duration),
     )
 
 

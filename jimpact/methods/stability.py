@@ -16,6 +16,7 @@ One function is compiled for each method and number of balls; it runs on batches
 points, which wait for their slowest point, so the number of steps is bounded.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -325,17 +326,11 @@ def stability_map(
             for m in chosen
         }
         classified, left_out = at_points(classes, points)
-    # of slices among all points
-    ends = np.cumsum([part[..., 0].size for part in parts])
+    shapes = [part.shape[:-1] for part in parts]
     by_slice = {}
     by_sample = {}
-    for name, columns in classified.items():
-        codes, errors = (np.split(column, ends) for column in columns)
-        by_slice[name] = tuple(
-            Slice(names, code.reshape(part.shape[:-1]), error.reshape(part.shape[:-1]))
-            for names, part, code, error in zip(axis_sets, parts, codes, errors)
-        )
-        by_sample[name] = Slice(("samples",), codes[-1], errors[-1])
+    for name, (codes, errors) in classified.items():
+        by_slice[name], by_sample[name] = _as_slices(axis_sets, shapes, codes, errors)
     return StabilityMap(
         methods=tuple(by_slice),
         axes=values,
@@ -347,6 +342,26 @@ def stability_map(
         max_steps=max_steps,
         left_out=left_out,
     )
+
+
+def _as_slices(
+    axis_sets: Sequence[tuple[str, ...]],
+    shapes: Sequence[tuple[int, ...]],
+    codes: np.ndarray,
+    errors: np.ndarray,
+) -> tuple[tuple[Slice, ...], Slice]:
+    """The slices of these axes and shapes, and that of the samples, which come last,
+    from the classes and errors (P,) of all points.
+    """
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    *codes_of_slices, sampled = np.split(codes, ends)
+    *errors_of_slices, errors_of_samples = np.split(errors, ends)
+    parts = zip(axis_sets, shapes, codes_of_slices, errors_of_slices)
+    slices = tuple(
+        Slice(names, code.reshape(shape), error.reshape(shape))
+        for names, shape, code, error in parts
+    )
+    return slices, Slice(("samples",), sampled, errors_of_samples)
 
 
 class Setup(NamedTuple):

@@ -410,22 +410,14 @@ def _one_pass(
     opened = ~was_open & is_open
     gamma, slip = _rates(problem, flown.state)
     fastest = jnp.maximum(-gamma, 0.0)
-    none = jnp.zeros(m, bool)
-    turned = none
-    stopped = none
+    turned = jnp.zeros(m, bool)
     vanished = run.vanished
     if problem.mu is not None:
         fastest = jnp.concatenate([fastest, slip])
     if springs:
         turned = flown.event[2 * m : 3 * m]
     elif problem.mu is not None:
-        friction = contact_modes(modes, flown.state).friction
-        flown, vanished = _ended_slip(problem, run, flown, friction, slip)
-        fired = flown.event[2 * m :]
-        stopped = slip_stops(settings, friction, fired, slip, flow.scales.slip)
-        at_limit = fired & friction.stick
-        turned = at_limit | stopped
-        flown = flown._replace(state=flow.stopped(stopped, flown.state))
+        flown, turned, vanished = _turned_friction(problem, run, flow, flown, slip)
     state = flown.state
     changes = closed | opened | turned
     happened = jnp.any(changes)
@@ -485,6 +477,32 @@ def _marks(
     takes_part = closed | opened | turned
     of_contacts = takes_part.astype(kind.dtype)
     return jnp.concatenate([jnp.stack([kind, no_law]), of_contacts])
+
+
+def _turned_friction(
+    problem: MotionProblem,
+    run: _CompliantRun,
+    flow: CompliantFlow,
+    flown: Flight,
+    slip: Float[Array, " m"],
+) -> tuple[Flight, Bool[Array, " m"], Float[Array, ""]]:
+    """Flight after its friction events, contacts whose friction turned, and the time
+    of `_ended_slip`.
+
+    Friction turns where a contact that stuck has reached mu F, or slip has stopped,
+    which is then set to 0. `slip`: its speeds [m/s] at the end of the step.
+    """
+    m = problem.contacts
+    modes = run.flight.aim.modes
+    friction = contact_modes(modes, flown.state).friction
+    flown, vanished = _ended_slip(problem, run, flown, friction, slip)
+    fired = flown.event[2 * m :]
+    scale = flow.scales.slip
+    stopped = slip_stops(problem.settings, friction, fired, slip, scale)
+    at_limit = fired & friction.stick
+    state = flow.stopped(stopped, flown.state)
+    flown = flown._replace(state=state)
+    return flown, at_limit | stopped, vanished
 
 
 def _ended_slip(

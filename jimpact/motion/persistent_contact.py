@@ -33,7 +33,7 @@ from jimpact.numerics.dense import (
     unit,
     unit_outside,
 )
-from jimpact.numerics.friction import solve
+from jimpact.numerics.friction import FrictionImpulses, solve
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.tools.masks import quotient
 from jimpact.tools.precision import precision
@@ -764,31 +764,16 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
     starts, and a contact that would slide although its forces are singular (it is
     wedged) where another solution exists.
     """
-    contacts, mu, touching, released, sliding, slip_began, slack = problem
+    contacts, mu, touching, released, sliding, _, slack = problem
     m = len(mu)
     known = last.known
     dtype = known.dtype
-    w = contacts.delassus
-    diagonal = jnp.diagonal(w)[:m]
-    # rows of contacts that take part: normals (m), then their tangents; others get
-    # lambda = 0
-    _, directions = known.shape
-    tangents = jnp.repeat(last.may_press, directions)
-    rows = jnp.concatenate([last.may_press, tangents])
-    free = jnp.where(rows, contacts.approach, 0.0)
-    solution = solve(
-        unit_outside(w, rows),
-        free[:m],
-        free[m:],
-        mu * jnp.ones(m, dtype),
-        complementary=True,
-        sliding=known.reshape(-1),
-    )
+    diagonal = jnp.diagonal(contacts.delassus)[:m]
+    solution = _solved(problem, known, last.may_press)
     every_force = jnp.concatenate([solution.normal, solution.tangential])
-    acceleration = contacts.approach + w @ every_force
+    acceleration = contacts.approach + contacts.delassus @ every_force
     of_gap = acceleration[:m]
-    # (m, r) of the slip
-    along = by_contact(acceleration[m:], m)
+    along = by_contact(acceleration[m:], m)  # acceleration of the slip
     is_known = length(known) > 0
     stays = of_gap <= slack
     # what has just let go needs a force, as an acceleration, that is no rounding
@@ -798,13 +783,7 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
     slip_starts = length(along) > slack
     slips = is_known | slip_starts
     slide = jnp.where(is_known[:, None], known, direction(along))
-    sign = slide[:, 0]
-    if in_space(contacts):
-        growth = jnp.sum(along * slide, axis=1)
-        margin = slip_begins(contacts, mu, solution.normal, growth)
-        slow = margin > 0
-        from_rest = slow & ~sliding & ~slip_began
-        sign = jnp.where(from_rest, float(BEGINS), 1.0)
+    sign = _sign_of_slip(problem, solution.normal, along, slide)
     modes = Modes(active, active & ~slips, sign)
     # what was taken to slide from rest must do so
     ahead = jnp.sum(known * along, axis=1)
@@ -839,6 +818,50 @@ def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
         done=consistent & ~jnp.any(contradicted),
         passes=last.passes + 1,
     )
+
+
+def _solved(
+    problem: _ModeProblem, known: Float[Array, "m r"], may_press: Bool[Array, " m"]
+) -> FrictionImpulses:
+    """Forces of the contacts that `may_press`, which slide along the `known`
+    directions, where these are not 0; lambda = 0 of others.
+    """
+    contacts = problem.contacts
+    m, directions = known.shape
+    tangents = jnp.repeat(may_press, directions)
+    rows = jnp.concatenate([may_press, tangents])  # normals (m), then their tangents
+    free = jnp.where(rows, contacts.approach, 0.0)
+    one = jnp.ones(m, known.dtype)
+    return solve(
+        unit_outside(contacts.delassus, rows),
+        free[:m],
+        free[m:],
+        problem.mu * one,
+        complementary=True,
+        sliding=known.reshape(-1),
+    )
+
+
+def _sign_of_slip(
+    problem: _ModeProblem,
+    normal: Float[Array, " m"],
+    along: Float[Array, "m r"],
+    slide: Float[Array, "m r"],
+) -> Float[Array, " m"]:
+    """`Modes.sign` of contacts that would slide along `slide` under these normal forces
+    [N], with the acceleration `along` of their slip [m/s^2].
+
+    In the plane the sign of the direction. In space 1, or `BEGINS` where slip starts
+    from rest as slowly as `slip_begins` says, unless a contact had that mode.
+    """
+    contacts = problem.contacts
+    if not in_space(contacts):
+        return slide[:, 0]
+    growth = jnp.sum(along * slide, axis=1)
+    margin = slip_begins(contacts, problem.mu, normal, growth)
+    slow = margin > 0
+    from_rest = slow & ~problem.sliding & ~problem.slip_began
+    return jnp.where(from_rest, float(BEGINS), 1.0)
 
 
 class Pressed(NamedTuple):

@@ -353,9 +353,7 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
     `joint`.
     """
     system, law, mu, h, closed_below, joint = problem
-    state = progress.state
-    q = state.q
-    v = state.v
+    q, v, *_ = progress.state
     dtype = q.dtype
     body = system.body
     middle = t + 0.5 * h
@@ -369,38 +367,29 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> 
     rubs = mu is not None
     contacts = contacts_of_step(system, q, middle, q_predicted, end, closed_below, rubs)
     rates = contacts.rates(v - base_velocity)
-    gamma = rates[:, 0]
+    speed = jnp.maximum(progress.speed, contacts.fastest(v))
     rounding = precision(dtype).accumulated
-    fastest = contacts.fastest(v)
-    speed = jnp.maximum(progress.speed, fastest)
-    if is_pile(system):
-        tolerance = max(PILE, rounding)
-    else:
-        tolerance = max(FEW, rounding)
+    tolerance = max(PILE if is_pile(system) else FEW, rounding)
     share = max(_ROUNDING, rounding)
     noise = share * speed + progress.residual_velocity
     noise += tolerance * contacts.fastest(h * free)
     by_loads = contacts.rates(free)[:, 0]
     slow = noise + SLOW * h * jnp.abs(by_loads)
-    approaches = gamma < -slow
+    approaches = rates[:, 0] < -slow
     strikes = contacts.closed & approaches
     # half of the forces before an impact, half after it: over the whole step they take
     # as much energy from the velocities as the potential gains
     half = 0.5 * h
-    impulse = jnp.zeros_like(rates)
-    law_status = jnp.int32(CODE["ok"])
     if joint:
         law_velocity = v
+        impulse = jnp.zeros_like(rates)
+        law_status = jnp.int32(CODE["ok"])
     else:
         law_velocity = v + half * free
         scene = scene_at(system, q, middle, contacts.closed)
         relative = law_velocity - base_velocity
-        shape = rates.shape
-        impulse, law_status = jax.lax.cond(
-            jnp.any(strikes),
-            lambda: _law_impulses(law, scene, relative, noise, shape),
-            lambda: (impulse, law_status),
-        )
+        struck = jnp.any(strikes)
+        impulse, law_status = _impulses_if(struck, law, scene, relative, noise, rates)
     rates = rates + contacts.product(impulse)
     added = jnp.where(strikes, half * by_loads, 0.0)
     e, e_t = _coefficients(problem, strikes, dtype)
@@ -454,12 +443,7 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
     h = problem.h
     contacts = setup.contacts
     v0 = progress.state.v
-    constant_mass = not callable(system.mass)
-    constant = constant_mass and system.force is None
-    if constant and system.body.coordinates is None:
-        tries = 1
-    else:
-        tries = MEAN
+    tries = _tries(system)
     if problem.mu is None:
         mu = jnp.zeros((), v0.dtype)
     else:
@@ -506,18 +490,33 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         may_retry = trial.tries < 2 * tries
         return due | (trial.adds_energy & may_retry)
 
+    start = _first_trial(progress, setup)
+    return jax.lax.while_loop(goes_on, iteration, start)
+
+
+def _first_trial(progress: _Progress, setup: _Setup) -> _Trial:
+    """No change of velocity, with the impulses of the last step to start from."""
+    v = progress.state.v
     zero = 0 * setup.speed
     begin = Many(
-        impulse=contacts.warm_start(progress.last_impulses),
+        impulse=setup.contacts.warm_start(progress.last_impulses),
         misfit=zero,
         residual_velocity=zero,
         iterations=jnp.int32(0),
         inverse_step_size=progress.inverse_step_size,
     )
-    no_force = jnp.zeros_like(v0)
+    no_force = jnp.zeros_like(v)
     no = jnp.asarray(False)
-    start = _Trial(v0, v0, no_force, begin, no, jnp.int32(0))
-    return jax.lax.while_loop(goes_on, iteration, start)
+    return _Trial(v, v, no_force, begin, no, jnp.int32(0))
+
+
+def _tries(system: System) -> int:
+    """Iterations of the mean velocity: 1 where no load depends on it, else MEAN."""
+    constant_mass = not callable(system.mass)
+    constant = constant_mass and system.force is None
+    if constant and system.body.coordinates is None:
+        return 1
+    return MEAN
 
 
 def _end_state(
@@ -741,6 +740,26 @@ def _offsets(
     at_end = jnp.concatenate([normal, w_t], axis=1)
     for_mean = jnp.concatenate([normal, slip], axis=1)
     return at_end, for_mean
+
+
+def _impulses_if(
+    struck: Bool[Array, ""],
+    law: Law,
+    scene: Scene,
+    v: Float[Array, " n"],
+    noise: Float[Array, ""],
+    rates: Float[Array, "m b"],
+) -> tuple[Float[Array, "m b"], Int[Array, ""]]:
+    """`_law_impulses` where a contact is `struck`; else none, of the shape of the
+    `rates`, and the status `ok`.
+    """
+    none = jnp.zeros_like(rates)
+    ok = jnp.int32(CODE["ok"])
+    return jax.lax.cond(
+        struck,
+        lambda: _law_impulses(law, scene, v, noise, rates.shape),
+        lambda: (none, ok),
+    )
 
 
 def _law_impulses(

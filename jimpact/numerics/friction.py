@@ -111,7 +111,8 @@ class _FrictionProblem(NamedTuple):
     @property
     def tolerance(self) -> float:
         """Misfit that counts as none, as a part of the size of the impulses."""
-        return gathered_rounding(len(self.friction), self.matrix.dtype)
+        m = len(self.friction)
+        return gathered_rounding(m, self.matrix.dtype)
 
 
 class _Modes(NamedTuple):
@@ -187,42 +188,48 @@ def solve(
     rows = len(slip) // m
     scaled = _by_contact(matrix, normal, slip, friction)
     scale = scaled.scale
-    drag = jnp.zeros((m, rows), matrix.dtype)  # p_t / p of contacts whose slip is known
+    dtype = matrix.dtype
+    drag = jnp.zeros((m, rows), dtype)  # p_t / p of contacts whose slip is known
     if sliding is not None:
         directions = sliding.reshape(m, rows)
         drag = -scaled.friction[:, None] * directions
         scaled = _with_known_slip(scaled, directions, drag)
     largest = jax.lax.stop_gradient(jnp.abs(scaled.rate).max())
-    size = jnp.where(largest > 0, largest, 1.0)
+    moves = largest > 0
+    size = jnp.where(moves, largest, 1.0)
     if load is not None:
         load = load * scaled.norm / size
-    numbers = (scaled.matrix, scaled.rate / size, scaled.friction, load)
+    rate = scaled.rate / size
+    numbers = (scaled.matrix, rate, scaled.friction, load)
     problem = _FrictionProblem(*numbers, complementary)
     fixed = _FrictionProblem(*jax.lax.stop_gradient(numbers), complementary)
-    decision = (_enumerate if m <= ENUMERATED else _search)(fixed)
+    decision = _decided(fixed)
     decided = decision.impulse
     modes, inverted = _most_at_rest(fixed, decision.modes, decided)
     free, code = _freedom(fixed, inverted)
     status = jnp.maximum(decision.status, code)
     x = _on_modes(problem, modes, inverted, decided)
     constant = jax.lax.stop_gradient(x)
-    (missed,) = _misfit(fixed, constant[..., None], _size(decided[..., None]))
+    missed = _misfit_of_one(fixed, constant, decided)
     wrong = ~(missed <= fixed.tolerance)
     unsolved = wrong & (status < CODE["infeasible"])
     status = jnp.where(unsolved, CODE["max_steps"], status)
-    dragged = tangents_of(x) + drag * normals_of(x)
-    both = jnp.concatenate([normals_of(x), dragged], axis=1)
+    with_drag = tangents_of(x) + drag * normals_of(x)
+    both = jnp.concatenate([normals_of(x), with_drag], axis=1)
     x = both * scale * size
     p = x[:, 0]
     if complementary:
-        p = jnp.where(p < 0, 0.0, p)  # rounding
+        pulls = p < 0
+        p = jnp.where(pulls, 0.0, p)  # rounding
     units_of_rows = jax.lax.stop_gradient(scale)[..., None]
-    free = units_of_rows * free.reshape(*scale.shape, -1)
+    by_contact = free.reshape(*scale.shape, -1)
+    free = units_of_rows * by_contact
     free = _normals_first(free)
     shares = None
     if decision.others is not None:
         units = jax.lax.stop_gradient(scale * size)[..., None]
-        shares = _normals_first(units * decision.others).T
+        others = units * decision.others
+        shares = _normals_first(others).T
     p_t = tangents_of(x).reshape(-1)
     return FrictionImpulses(p, p_t, status, free, shares)
 
@@ -258,23 +265,28 @@ def _by_contact(
     """
     m = len(normal)
     rows = len(slip) // m
+    numbers = np.arange(m)
     tangents = m + np.arange(m * rows).reshape(m, rows)
-    order = np.concatenate([np.arange(m)[:, None], tangents], 1)
+    order = np.concatenate([numbers[:, None], tangents], 1)
     of_contacts = matrix[order[:, :, None, None], order[None, None]]
-    squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
+    diagonal = jnp.diagonal(jax.lax.stop_gradient(matrix))
+    squares = diagonal[order]
     of_tangents = jnp.mean(tangents_of(squares), axis=1)
     of_normals = squares[:, 0]
     squares = jnp.stack([of_normals, of_tangents], axis=1)
-    norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
+    positive = squares > 0
+    norm = jnp.sqrt(jnp.where(positive, squares, 1.0))
     repeats = np.array([1, rows])
     entries = 1 + rows
     scale = 1 / jnp.repeat(norm, repeats, axis=1, total_repeat_length=entries)
     slip_rows = slip.reshape(m, rows)
-    rate = jnp.concatenate([normal[:, None], slip_rows], axis=1) * scale
-    scaled_friction = friction * norm[:, -1] / norm[:, 0]
+    rates = jnp.concatenate([normal[:, None], slip_rows], axis=1)
+    rate = rates * scale
+    of_normal = norm[:, 0]
+    scaled_friction = friction * norm[:, -1] / of_normal
     scaled_rows = of_contacts * scale[:, :, None, None]
     scaled_matrix = scaled_rows * scale[None, None]
-    return _ByContact(scaled_matrix, rate, scaled_friction, norm[:, 0], scale)
+    return _ByContact(scaled_matrix, rate, scaled_friction, of_normal, scale)
 
 
 def _with_known_slip(
@@ -285,11 +297,13 @@ def _with_known_slip(
     Their `p_t = drag p` moves into the column of p; their p_t get unit rows, rates 0
     and friction 0.
     """
-    slides = jnp.any(directions != 0, axis=1)
+    is_known = directions != 0
+    slides = jnp.any(is_known, axis=1)
     terms = _of_tangents(given.matrix) * drag[None, None]
     dragged = jnp.sum(terms, axis=3)
     matrix = given.matrix.at[..., 0].add(dragged)
-    of_rows = jnp.repeat(slides[:, None], directions.shape[1], axis=1)
+    _, tangents = directions.shape
+    of_rows = jnp.repeat(slides[:, None], tangents, axis=1)
     decoupled = jnp.pad(of_rows, ((0, 0), (1, 0)))
     apart = decoupled[:, :, None, None] | decoupled[None, None]
     identity = jnp.eye(given.rate.size, dtype=matrix.dtype)
@@ -305,7 +319,8 @@ def _normals_first(x: Float[Array, "m b N"]) -> Float[Array, "n N"]:
     """Rows of contacts reordered: the normal of each, then the tangents,
     contact-major.
     """
-    tangents = tangents_of(x).reshape(-1, x.shape[2])
+    *_, columns = x.shape
+    tangents = tangents_of(x).reshape(-1, columns)
     return jnp.concatenate([x[:, 0], tangents])
 
 
@@ -322,12 +337,13 @@ def _rates(
     problem: _FrictionProblem, x: Float[Array, "m b N"]
 ) -> Float[Array, "m b N"]:
     """Rates `(r, s) = (a, b) + A x` of N impulses x."""
+    constant = problem.rate[..., None]
     if len(x) <= ENUMERATED:
         product = _times(problem.matrix[..., None], x)
-        return problem.rate[..., None] + product
+        return constant + product
     # never computed twice
     product = jnp.tensordot(problem.matrix, x, 2)
-    return problem.rate[..., None] + product
+    return constant + product
 
 
 def _times(
@@ -343,21 +359,24 @@ def _bound(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, 
     p = jnp.maximum(x[:, 0], 0.0)
     if problem.load is not None:
         p = p + problem.load[:, None]
-    return problem.friction[:, None] * p
+    mu = problem.friction[:, None]
+    return mu * p
 
 
 def _rubs(problem: _FrictionProblem) -> Bool[Array, "m 1"]:
     """Mask of contacts with friction: without it none sticks, also where it does not
     slip.
     """
-    return problem.friction[:, None] > 0
+    mu = problem.friction[:, None]
+    return mu > 0
 
 
 def _size(x: Float[Array, "m b *N"]) -> Float[Array, "*N"]:
     """Sizes `1 + max |x|` of one or N impulses; the rates without impulses have size
     1.
     """
-    return 1 + jnp.abs(x).max(axis=(0, 1))
+    largest = jnp.abs(x).max(axis=(0, 1))
+    return 1 + largest
 
 
 def _misfit(
@@ -379,12 +398,24 @@ def _misfit(
         normal = jnp.minimum(p, r)
     else:
         normal = r
-    wrong = side - in_disc(side - tangents_of(rate), _bound(problem, x))
+    bound = _bound(problem, x)
+    tried = side - tangents_of(rate)
+    wrong = side - in_disc(tried, bound)
     of_normals = jnp.abs(normal).max(axis=0)
-    most = jnp.maximum(of_normals, jnp.abs(wrong).max(axis=(0, 1)))
+    of_tangents = jnp.abs(wrong).max(axis=(0, 1))
+    most = jnp.maximum(of_normals, of_tangents)
     if size is None:
         size = _size(x)
     return most / size
+
+
+def _misfit_of_one(
+    problem: _FrictionProblem, x: Float[Array, "m b"], decided: Float[Array, "m b"]
+) -> Float[Array, ""]:
+    """`_misfit` of the impulses x alone, by the size of those that were `decided`."""
+    size = _size(decided[..., None])
+    (missed,) = _misfit(problem, x[..., None], size)
+    return missed
 
 
 def _equations(
@@ -398,14 +429,16 @@ def _equations(
     direction. With Q = beta e e^T, e orthogonal to d, beta = mu p / (mu p + |s|), this
     is Newton's method for the direction of slip.
     """
-    m, rows = modes.direction.shape[:2]
+    m, rows, _ = modes.direction.shape
     dtype = problem.matrix.dtype
     one = jnp.eye(rows, dtype=dtype)[None, ..., None]
-    q = modes.sticks[:, None, None].astype(dtype) * one
+    sticks = modes.sticks[:, None, None]
+    q = sticks.astype(dtype) * one
     if rows == 2:
         first, second = jnp.moveaxis(modes.direction, 1, 0)
         e = jnp.stack([-second, first], axis=1)
-        q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
+        beta = modes.turning[:, None, None]
+        q = q + beta * e[:, :, None] * e[:, None]
     q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0)))
     takes = modes.taking.astype(dtype)
     q = q.at[:, 0, 0].set(takes)
@@ -415,7 +448,8 @@ def _equations(
     own = identity[:, None, :, None, None]
     first_row = jnp.eye(1 + rows, dtype=dtype)[0]
     of_normal = first_row[None, None, None, :, None]
-    friction_direction = modes.direction * problem.friction[:, None, None]
+    mu = problem.friction[:, None, None]
+    friction_direction = modes.direction * mu
     one_row = (1, 0)
     friction_direction = jnp.pad(friction_direction, ((0, 0), one_row, (0, 0)))
     pressed = friction_direction[:, :, None, None] * own * of_normal
@@ -428,8 +462,10 @@ def _equations(
     terms = q * problem.rate[:, None, :, None]
     right = -jnp.sum(terms, axis=2)
     if problem.load is not None:
-        right = right - friction_direction * problem.load[:, None, None]
-    return moved + pressed + unit[..., None], right
+        load = problem.load[:, None, None]
+        right = right - friction_direction * load
+    matrix = moved + pressed + unit[..., None]
+    return matrix, right
 
 
 def _turned(
@@ -440,19 +476,22 @@ def _turned(
 
     `turning` is the beta of `_equations`.
     """
-    if modes.direction.shape[1] == 1:
+    _, tangents, _ = modes.direction.shape
+    if tangents == 1:
         return modes
     slip = tangents_of(_rates(problem, x))
     # along d where a contact slides, and where it only reaches its cone
     pull = slip - tangents_of(x)
     length = length_of(pull)
     bound = _bound(problem, x)
-    slides = (length_of(modes.direction) > 0) & (length > 0)
+    had_direction = length_of(modes.direction) > 0
+    slides = had_direction & (length > 0)
     new = over(pull, length)
     direction = jnp.where(slides[:, None], new, modes.direction)
     both = bound + length_of(slip)
-    share = bound / jnp.where(both > 0, both, 1.0)
-    turning = jnp.where(slides & (both > 0), share, 0.0)
+    some = both > 0
+    share = bound / jnp.where(some, both, 1.0)
+    turning = jnp.where(slides & some, share, 0.0)
     return modes._replace(direction=direction, turning=turning)
 
 
@@ -467,9 +506,11 @@ def _solved(problem: _FrictionProblem, modes: _Modes) -> Float[Array, "m b N"]:
 
     def refine(_: Any, x: Float[Array, "m b N"]) -> Float[Array, "m b N"]:
         """One refinement `x + E^-1 (right - E x)` by the approximate inverse."""
-        return x + _times(inverse, right - _times(matrix, x))
+        missed = right - _times(matrix, x)
+        return x + _times(inverse, missed)
 
-    return fori_loop(0, 3, refine, jnp.zeros_like(right))
+    none = jnp.zeros_like(right)
+    return fori_loop(0, 3, refine, none)
 
 
 # ------------------------------------------------------------------- the decision
@@ -488,15 +529,21 @@ def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarr
         slides = _DIRECTIONS
     if not loaded:
         unloaded = itertools.product(range(2 + slides), repeat=contacts)
-        table = np.array(
-            sorted(unloaded, key=lambda k: (np.count_nonzero(k), k.count(1)))
-        ).T
+        most_first = sorted(unloaded, key=lambda k: (np.count_nonzero(k), k.count(1)))
+        table = np.array(most_first).T
         return table, table != 1
     of_contact = itertools.product((0, *range(2, 2 + slides)), (True, False))
     of_all = itertools.product(list(of_contact), repeat=contacts)
     ordered = sorted(of_all, key=lambda k: sum((kind > 0) for kind, _ in k))
     kinds, taking = np.array(ordered).T
     return kinds, taking == 1
+
+
+def _decided(problem: _FrictionProblem) -> _Decision:
+    """By all modes of up to ENUMERATED contacts, of more by `_search`."""
+    if len(problem.friction) <= ENUMERATED:
+        return _enumerate(problem)
+    return _search(problem)
 
 
 def _enumerate(problem: _FrictionProblem) -> _Decision:
@@ -532,9 +579,12 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
     misfit = _misfit(problem, x)
     root = precision(dtype).root
     # larger impulses are the rounding of a singular matrix
-    good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
+    within = misfit <= problem.tolerance
+    small = _size(x) < 1 / root
+    good = within & small
+    some_good = jnp.any(good)
     first_good = jnp.argmax(good)
-    best = jnp.where(jnp.any(good), first_good, jnp.nanargmin(misfit))
+    best = jnp.where(some_good, first_good, jnp.nanargmin(misfit))
 
     def differ(values: Float[Array, "m b N"]) -> Bool[Array, ""]:
         """True if these values of consistent modes differ from those of the chosen
@@ -543,7 +593,8 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
         of_best = values[..., best][..., None]
         apart = jnp.abs(values - of_best).max(axis=(0, 1))
         different = root * _size(x[..., best])
-        return jnp.any(good & (apart > different))
+        differs = apart > different
+        return jnp.any(good & differs)
 
     several_impulses = differ(x)
     status = jnp.where(several_impulses, CODE["impulse_not_unique"], CODE["ok"])
@@ -555,9 +606,9 @@ def _enumerate(problem: _FrictionProblem) -> _Decision:
     signed = jnp.concatenate([p, -p])  # p and -p (2 m, N)
     of_good = jnp.where(good, signed, jnp.inf)
     extreme = jnp.argmin(of_good, axis=1)
-    chosen_others = jnp.where(jnp.any(good), extreme, best)
+    chosen_others = jnp.where(some_good, extreme, best)
     others = x[..., chosen_others]
-    code = jnp.where(jnp.any(good), status, none)
+    code = jnp.where(some_good, status, none)
     return _Decision(chosen, x[..., best], code, others)
 
 
@@ -565,17 +616,18 @@ def _newton(
     problem: _FrictionProblem, modes: _Modes
 ) -> tuple[_Modes, Float[Array, "m b N"]]:
     """Impulses x of modes, in space with the directions of slip that they lead to."""
-    count = modes.taking.shape[1]
+    _, tangents, count = modes.direction.shape
     none = jnp.zeros((*problem.rate.shape, count), problem.matrix.dtype)
-    if modes.direction.shape[1] == 1:
+    if tangents == 1:
         return modes, _solved(problem, modes)
 
     def step(
         _: Any, state: tuple[_Modes, Float[Array, "m b N"]]
     ) -> tuple[_Modes, Float[Array, "m b N"]]:
         """Modes with the directions of slip of their impulses x, and x."""
-        x = _solved(problem, state[0])
-        return _turned(problem, state[0], x), x
+        last, _ = state
+        x = _solved(problem, last)
+        return _turned(problem, last, x), x
 
     return fori_loop(0, _ITERATIONS, step, (modes, none))
 
@@ -590,20 +642,24 @@ def _at_rest(
     whose load only begins, and that does not press, leaves. Of those that take part and
     push, or have a load, the fast ones slide and the others stick, if they rub.
     """
-    rate = _rates(problem, x[..., None])  # (r, s)
-    margin = (margin * _size(x[..., None]))[None]
+    column = x[..., None]
+    rate = _rates(problem, column)  # (r, s)
+    r = rate[:, 0]
+    p = normals_of(x)
+    margin = (margin * _size(column))[None]
     if problem.complementary:
-        taking = rate[:, 0] <= margin
+        taking = r <= margin
     else:
-        taking = jnp.ones(rate[:, 0].shape, bool)
+        taking = jnp.ones(r.shape, bool)
     if problem.load is not None:
         small = problem.load < precision(x.dtype).eps
         begins = (problem.load > 0) & small
-        leaves = begins[:, None] & (normals_of(x) <= margin)
+        leaves = begins[:, None] & (p <= margin)
         taking = taking & ~leaves
-    pushes = taking & (normals_of(x) >= -margin)
+    pushes = taking & (p >= -margin)
     if problem.load is not None:
-        pushes = pushes | (problem.load[:, None] > 0)
+        loaded = problem.load[:, None] > 0
+        pushes = pushes | loaded
     slip = tangents_of(rate)
     speed = length_of(slip)
     slides = pushes & (speed > margin)
@@ -612,7 +668,7 @@ def _at_rest(
     direction = jnp.where(slides[:, None], along, 0.0)
     no_turning = jnp.zeros(speed.shape, x.dtype)
     modes = _Modes(taking, sticks, direction, no_turning)
-    return _turned(problem, modes, x[..., None])
+    return _turned(problem, modes, column)
 
 
 class _Inverted(NamedTuple):
@@ -641,24 +697,28 @@ def _inverted(
     weight = 1 / jnp.sqrt(_weights(problem, x))
     weighted = matrix[..., 0] * weight[None, None]
     scaled = weighted.reshape(n, n)
+    held = jnp.asarray(True)
     if n > _SHARED:
         eye = jnp.eye(n, dtype=x.dtype)
         regular = jnp.linalg.inv(scaled + _RIDGE * eye)
-        return _Inverted(regular, 0 * eye, weight, jnp.asarray(True))
+        return _Inverted(regular, 0 * eye, weight, held)
     left, values, right, null = singular_values(scaled)
     divisor = jnp.where(null, 1.0, values)
     inverse = (right.T / divisor[None]) @ left.T
     free = jnp.where(null[None], left, 0.0)
-    return _Inverted(inverse, free @ right, weight, jnp.asarray(True))
+    return _Inverted(inverse, free @ right, weight, held)
 
 
 def _weights(problem: _FrictionProblem, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
     """Weights w of the `sum w x^2` that shared impulses make least: 1 of p, 1 / share
     of p_t.
     """
-    share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
-    of_tangents = jnp.repeat(1 / share, x.shape[1] - 1, 1)
-    return jnp.concatenate([jnp.ones_like(share), of_tangents], 1)
+    bound = _bound(problem, x[..., None])
+    share = load_shares(bound, _LEAST_SHARE)
+    _, b = x.shape
+    of_tangents = jnp.repeat(1 / share, b - 1, 1)
+    of_normal = jnp.ones_like(share)
+    return jnp.concatenate([of_normal, of_tangents], 1)
 
 
 def _most_at_rest(
@@ -674,13 +734,15 @@ def _most_at_rest(
     margin = jnp.asarray(problem.tolerance, x.dtype)
     rest = _at_rest(problem, x, margin)
     # loads that begin open contacts
-    modes = modes._replace(taking=modes.taking & rest.taking)
+    taking = modes.taking & rest.taking
+    modes = modes._replace(taking=taking)
     both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
     inverted = jax.lax.map(lambda modes: _inverted(problem, modes, x), both)
-    inverted = inverted._replace(held=jnp.array([False, True]))
+    held = jnp.array([False, True])
+    inverted = inverted._replace(held=held)
     first = jax.tree.map(lambda leaf: leaf[0], inverted)
     shared = _on_modes(problem, rest, first, x)
-    (missed,) = _misfit(problem, shared[..., None], _size(x[..., None]))
+    missed = _misfit_of_one(problem, shared, x)
     allowed = missed <= problem.tolerance
     choices = (both, inverted)
     return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), choices)
@@ -692,12 +754,15 @@ def _freedom(
     """Columns `D V_0 U_0^T` in which impulses are free, and a status that says what
     they change.
     """
-    free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
+    weight = inverted.weight.reshape(-1, 1)
+    free = weight * inverted.pairs.T
     if len(free) > _SHARED:  # there the inverse is large where impulses are free
-        not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
+        largest = jnp.max(jnp.abs(inverted.inverse))
+        not_unique = largest > _RIDGE**-0.5
         return free, jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
     # contacts that slide may share p so that slip changes
-    moves = jnp.abs(problem.matrix.reshape(free.shape) @ free)
+    matrix = problem.matrix.reshape(free.shape)
+    moves = jnp.abs(matrix @ free)
     root = precision(free.dtype).root
     some_free = jnp.any(free != 0)
     code = jnp.where(some_free, CODE["impulse_not_unique"], CODE["ok"])
@@ -727,13 +792,16 @@ def _on_modes(
         x = (weight * y).reshape(shape)
         turned = _turned(problem, modes, x[..., None])
         matrix, right = _equations(problem, turned)
-        shared = weight**2 * _weights(problem, x).reshape(n) * y
-        free = inverted.pairs @ jnp.where(inverted.held, y - start, shared)
+        of_shares = _weights(problem, x).reshape(n)
+        shared = weight**2 * of_shares * y
+        change = jnp.where(inverted.held, y - start, shared)
+        free = inverted.pairs @ change
         product = matrix.reshape(n, n) @ x.reshape(n)
         missed = product - right.reshape(n) + free
         return y - inverted.inverse @ missed
 
-    return (weight * fori_loop(0, 3, step, start)).reshape(shape)
+    last = fori_loop(0, 3, step, start)
+    return (weight * last).reshape(shape)
 
 
 # ------------------------------------------------------------------- many contacts
@@ -754,11 +822,13 @@ def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
     pull = tangents_of(rate) - tangents_of(x)
     bound = _bound(problem, x)
     length = length_of(pull)
-    sticks = (length <= bound) & _rubs(problem)
+    within = length <= bound
+    sticks = within & _rubs(problem)
     slides = ~sticks & (bound > 0)
     along = over(pull, length)
     direction = jnp.where(slides[:, None], along, 0.0)
-    modes = _Modes(taking, sticks, direction, jnp.zeros_like(p))
+    no_turning = jnp.zeros_like(p)
+    modes = _Modes(taking, sticks, direction, no_turning)
     return _turned(problem, modes, x)
 
 
@@ -781,19 +851,9 @@ def _search(problem: _FrictionProblem) -> _Decision:
         """Largest violation of the law by x, as a part of its size."""
         return _misfit(problem, x[..., None])[0]
 
-    def polish(x: Float[Array, "m b"]) -> Float[Array, "m b"]:
-        """x after a step of Newton's method on its modes; what is free in them stays as
-        it is.
-        """
-        equations = _equations(problem, _modes_at(problem, x))
-        matrix, right = (y[..., 0] for y in equations)
-        product = jnp.sum(matrix * x[None, None], axis=(2, 3))
-        missed = (right - product)[..., None]
-        return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
-
     def newton(now: _Polish) -> _Polish:
         """The next x of Newton's method, which may be worse, and the best x."""
-        x = polish(now.impulse)
+        x = _polished(problem, now.impulse)
         best_so_far = better(misfit, now.best, x)
         return _Polish(x, best_so_far, now.steps + 1)
 
@@ -803,7 +863,8 @@ def _search(problem: _FrictionProblem) -> _Decision:
 
     def goes_on(now: _Polish) -> Bool[Array, ""]:
         """True while the best x is wrong and steps are left."""
-        return wrong(now.best) & (now.steps < _POLISHES)
+        some_left = now.steps < _POLISHES
+        return wrong(now.best) & some_left
 
     def attempt(state: tuple[Best, Int[Array, ""]]) -> tuple[Best, Int[Array, ""]]:
         """The best so far, or what attempt `number` leads to, and the number of the
@@ -817,7 +878,8 @@ def _search(problem: _FrictionProblem) -> _Decision:
             last_try = jnp.where(last, swept, tried.impulse)
             tried = better(misfit, tried, last_try)
         begin = _Polish(tried.impulse, tried, jnp.asarray(0))
-        tried = while_loop(goes_on, newton, begin).best
+        last_polish = while_loop(goes_on, newton, begin)
+        tried = last_polish.best
         less = tried.misfit < best.misfit
         best = choose(less, tried, best)
         return best, number + 1
@@ -825,10 +887,9 @@ def _search(problem: _FrictionProblem) -> _Decision:
     def attempts_left(state: tuple[Best, Int[Array, ""]]) -> Bool[Array, ""]:
         """True while the best impulses are wrong and attempts are left."""
         best, number = state
-        return wrong(best) & (number < most)
+        some_left = number < most
+        return wrong(best) & some_left
 
-    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype)
-    unit = unit.reshape(problem.matrix.shape)
     cones = cones_of(*problem)
     none = jnp.zeros_like(problem.rate)
     unknown = jnp.inf + 0 * jnp.sum(problem.rate)
@@ -838,8 +899,26 @@ def _search(problem: _FrictionProblem) -> _Decision:
     else:
         most = ATTEMPTS
     best, _ = while_loop(attempts_left, attempt, start)
-    status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
-    return _Decision(_modes_at(problem, best.impulse), best.impulse, status, None)
+    unsolved = wrong(best)
+    status = jnp.where(unsolved, CODE["max_steps"], CODE["ok"])
+    modes = _modes_at(problem, best.impulse)
+    return _Decision(modes, best.impulse, status, None)
+
+
+def _polished(problem: _FrictionProblem, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+    """x after a step of Newton's method on its modes; what is free in them stays as it
+    is.
+    """
+    modes = _modes_at(problem, x)
+    equations = _equations(problem, modes)
+    matrix, right = (y[..., 0] for y in equations)
+    product = jnp.sum(matrix * x[None, None], axis=(2, 3))
+    missed = right - product
+    identity = jnp.eye(x.size, dtype=x.dtype)
+    unit = identity.reshape(matrix.shape)
+    regular = matrix + _RIDGE * unit
+    change = block_solve(regular, missed[..., None])
+    return x + change[..., 0]
 
 
 def _projected(
@@ -904,27 +983,32 @@ def distribute(
     ([False, False], [1.0, 1.0])
     """
     matrix, rate, limit = jax.lax.stop_gradient((matrix, rate, limit))
-    rows = len(matrix) // len(limit)
+    m, _ = limit.shape
+    rows = len(matrix) // m
     limit = jnp.where(candidates, limit, 0.0)
-    each = jnp.repeat(candidates, rows, axis=0)
-    both = each[:, None] & each[None]
+    of_rows = jnp.repeat(candidates, rows, axis=0)
+    both = of_rows[:, None] & of_rows[None]
     matrix = jnp.where(both, matrix, 0.0)
-    rate = jnp.where(each, rate, 0.0)
+    rate = jnp.where(of_rows, rate, 0.0)
     force = _relaxed(matrix, rate, limit)
     slip = rate + times(matrix, force)
-    stick = _lengths(force, rows) < (1 - _INSIDE) * limit
+    size = _lengths(force, rows)
+    inside = (1 - _INSIDE) * limit
+    stick = size < inside
     if rows == 1:
         scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
         stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
-    loaded = _lengths(force, rows) > 0
+    loaded = size > 0
     pushed = jnp.repeat(loaded, rows, axis=0)
-    return candidates & stick, jnp.where(pushed, -force, slip)
+    toward = jnp.where(pushed, -force, slip)
+    return candidates & stick, toward
 
 
 def _lengths(force: Float[Array, "t *B"], rows: int) -> Float[Array, "m *B"]:
     """|lambda_j| of each contact j, from its one or two tangential rows."""
     by_contact = force.reshape(-1, rows, *force.shape[1:])
-    return jnp.sqrt(jnp.sum(by_contact**2, axis=1))
+    squares = jnp.sum(by_contact**2, axis=1)
+    return jnp.sqrt(squares)
 
 
 class _Sweep(NamedTuple):
@@ -948,12 +1032,15 @@ def _relaxed(
     m = len(limit)
     t, *batch = rate.shape
     rows = t // m
-    least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
+    largest = jnp.max(limit, axis=0, keepdims=True)
+    settled = _SETTLED * largest
     of_contacts = matrix.reshape(m, rows, t, *batch)
-    diagonal = matrix[np.arange(t), np.arange(t)]
-    own = diagonal.reshape(m, rows, *batch)
-    stiffness = jnp.sum(own, axis=1)
-    stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
+    row = np.arange(t)
+    diagonal = matrix[row, row]
+    by_contact = diagonal.reshape(m, rows, *batch)
+    stiffness = jnp.sum(by_contact, axis=1)
+    some = stiffness > 0
+    stiffness = jnp.where(some, stiffness, 1.0)[:, None]  # no step is too long
 
     def relax(
         j: Int[Array, ""] | int, force: Float[Array, "t B"]
@@ -961,26 +1048,34 @@ def _relaxed(
         """Forces after `lambda_j <- P(lambda_j - u_j' / stiffness_j)`, P projects on
         disc j.
         """
-        at_contact = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
-        at_rest = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows)
+        first = rows * j
+        at_contact = jax.lax.dynamic_slice_in_dim(force, first, rows)
+        at_rest = jax.lax.dynamic_slice_in_dim(rate, first, rows)
         change = at_rest + times(of_contacts[j], force)
         tried = at_contact - change / stiffness[j]
-        most = limit[j][None]
+        radius = limit[j][None]
         length = _lengths(tried, rows)
-        ratio = most / jnp.where(length > 0, length, 1.0)
-        shrink = jnp.where(length > most, ratio, 1.0)
-        return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
+        moves = length > 0
+        outside = length > radius
+        ratio = radius / jnp.where(moves, length, 1.0)
+        shrink = jnp.where(outside, ratio, 1.0)
+        new = tried * shrink
+        return jax.lax.dynamic_update_slice_in_dim(force, new, first, 0)
 
     def sweep(now: _Sweep) -> _Sweep:
         """The forces after each contact was relaxed once more."""
         force = fori_loop(0, m, relax, now.force)
-        changes = jnp.any(jnp.abs(force - now.force) > least)
+        change = jnp.abs(force - now.force)
+        changes = jnp.any(change > settled)
         return _Sweep(force, changes, now.done + 1)
 
     def goes_on(now: _Sweep) -> Bool[Array, ""]:
         """True while forces change and sweeps are left."""
-        return now.changes & (now.done < _RELAXATIONS)
+        some_left = now.done < _RELAXATIONS
+        return now.changes & some_left
 
     some_load = jnp.any(limit > 0)
-    start = _Sweep(jnp.zeros_like(rate), some_load, jnp.asarray(0))
-    return while_loop(goes_on, sweep, start).force
+    no_force = jnp.zeros_like(rate)
+    start = _Sweep(no_force, some_load, jnp.asarray(0))
+    last = while_loop(goes_on, sweep, start)
+    return last.force

@@ -253,19 +253,12 @@ def _linearized(
     rates = jnp.pad(of_rows, ((0, 0), (0, 0), (0, 2)))
     normal_rows = _normal(cones, at)[:, None]
     own = jnp.concatenate([normal_rows, at.side], axis=1).reshape(n)
-    coupled = jnp.tensordot(cones.coupling.reshape(m, b, n), own, axes=1)
+    coupled = jnp.tensordot(of_rows, own, axes=1)
     missed = cones.constant + coupled
     square = jnp.sum(at.slip**2, axis=1)
     speed = jnp.sqrt(square)
     smoothed = speed**2 + slides * _mean(cones, at)
     turns = (speed / smoothed)[:, None] * at.slip
-
-    def dot(
-        values: Float[Array, "m rows"], forms: Float[Array, "m rows w"]
-    ) -> Float[Array, "m w"]:
-        """Sums `sum_i v_ji f_ji` over the tangents i of each contact j."""
-        return jnp.sum(values[..., None] * forms, axis=1)
-
     side = tangents_of(x)
     gap = (tangents_of(missed) - at.slip)[..., None]
     slip = tangents_of(rates) + gap * constant[None]
@@ -281,13 +274,13 @@ def _linearized(
     inner = radius * at.bound + of_sides
     known_part = aim - inner[:, None] * constant
     bound = known_part - at.bound[:, None] * push
-    turned = bound - dot(at.side, slip) - dot(at.slip, side)
+    turned = bound - _dot(at.side, slip) - _dot(at.slip, side)
     bound = turned / radius[:, None]
     normal = rates[:, 0] + missed[:, 0, None] * constant
     if cones.complementary:
         off = speed - at.bound - at.normal
         known_part = normal + off[:, None] * constant
-        normal = known_part + dot(turns, slip) - bound
+        normal = known_part + _dot(turns, slip) - bound
         of_normal = at.push[:, None] * normal
         first = of_normal + at.normal[:, None] * push - product
     else:
@@ -304,6 +297,14 @@ def _linearized(
     matrix = equations[..., :n].reshape(m, b, m, b)
     point = _Inside(push, normal, side, bound, slip)
     return point, matrix, -equations[..., n:]
+
+
+def _dot(
+    values: Float[Array, "m rows"], forms: Float[Array, "m rows w"]
+) -> Float[Array, "m w"]:
+    """Sums `sum_i v_ji f_ji` over the tangents i of each contact j."""
+    products = values[..., None] * forms
+    return jnp.sum(products, axis=1)
 
 
 def _room_of_normals(at: _Inside, way: _Inside) -> Float[Array, ""]:

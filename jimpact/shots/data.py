@@ -150,13 +150,7 @@ class Experiments(eqx.Module):
             self.scenes = None
         else:
             self.scenes = _as_scenes(scenes, self.pre.shape)
-        labels = range(1, len(measured) + 1) if shots is None else shots
-        self.shots = tuple(map(str, labels))
-        if len(self.shots) != len(measured):
-            raise ValueError(
-                f"Argument `shots` must have {len(measured)} labels, one per shot, "
-                f"but has {len(self.shots)}."
-            )
+        self.shots = _as_labels(shots, len(measured))
         of_shots = np.broadcast_to(lost_freedom, len(measured))
         self.lost = tuple(of_shots.tolist())
         self.units = _as_units(units, measured.shape[1])
@@ -594,6 +588,22 @@ def _as_rows(name: str, value: Any) -> jax.Array:
             f"but has shape {tuple(array.shape)}."
         )
     return array
+
+
+def _as_labels(shots: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    """Labels of so many shots: those given, as text; None: 1, 2, ...
+
+    ValueError: another number of them.
+    """
+    if shots is None:
+        return tuple(map(str, range(1, count + 1)))
+    labels = tuple(map(str, shots))
+    if len(labels) != count:
+        raise ValueError(
+            f"Argument `shots` must have {count} labels, one per shot, "
+            f"but has {len(labels)}."
+        )
+    return labels
 
 
 def _as_units(units: Sequence[str] | None, n: int) -> tuple[str, ...]:

@@ -131,18 +131,16 @@ def find_impacts(
     else:
         given = _of_coordinates("sigma", sigma, n)
     check_values("sigma", given, low=0.0, open_low=True)
-    check_values("contact", np.asarray(contact, float), low=0.0)
-    if window is not None:
-        check_values("window", np.asarray(window, float), low=0.0, open_low=True)
+    check_values("contact", contact, low=0.0)
+    check_values("window", window, low=0.0, open_low=True)
     flight = _model(acceleration, drag, names, spin_of(t, spin))
     angles = tuple(name == "rad" for name in names)
     frames = Frames(t - t.mean(), q, given, angles)
     settings = Settings(sigma is None, contact, shortest, window)
     notes = [*findings_of_input(raw, given, names), *findings_of_bodies(raw)]
     if not flight.unknown.any():
-        notes += findings_of_signs(
-            flight.straight(frames), flight.acceleration, shortest
-        )
+        straight = flight.straight(frames)
+        notes += findings_of_signs(straight, flight.acceleration, shortest)
     search = searched(frames, flight, settings)
     whole, flights = fitted_arcs(search)
     arcs = whole
@@ -151,11 +149,10 @@ def find_impacts(
     if acceleration_is_known(flight):
         notes += findings_of_held(t, search.verdict.flights, search.candidates)
     doubtful = doubts(search, arcs)
-    notes += [
-        *findings(search, arcs, whole.members, rough),
-        *findings_of_doubts(doubtful),
-    ]
-    candidates = notes_of(search, len(search.verdict.flights) - len(flights))
+    notes += findings(search, arcs, whole.members, rough)
+    notes += findings_of_doubts(doubtful)
+    left_out = len(search.verdict.flights) - len(flights)
+    candidates = notes_of(search, left_out)
     track = _as_track(t, _unwrapped(raw, names), arcs, names, doubtful)
     return replace(track, warnings=tuple(notes), candidates=tuple(candidates))
 
