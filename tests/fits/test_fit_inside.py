@@ -162,12 +162,20 @@ def test_masks_groups_and_held_contacts():
 
 
 def test_damping_follows_the_gain_ratio():
-    """Nielsen: times 1/3 where all that was promised is gained, 1 at half of it; 2, 4, ... after."""
-    damping = Damping(*jnp.asarray([0.3, 2.0, 1.0]))
-    np.testing.assert_allclose(damping.after(jnp.asarray(1.0)).value, 0.1)
-    np.testing.assert_allclose(damping.after(jnp.asarray(0.5)).value, 0.3)
-    twice = damping.after(jnp.asarray(-1.0)).after(jnp.asarray(-1.0))
-    np.testing.assert_allclose([twice.value, twice.growth], [0.3 * 2 * 4, 8.0])
+    """Nielsen's rule: a third of mu after a step that gains all that was promised, mu
+    itself after one that gains half of it; 2 mu, then 2 * 4 mu after steps that fail.
+    """
+    mu = 0.3
+    promised = 1.0
+    damping = Damping(*jnp.asarray([mu, 2.0, promised]))
+    all_of_it, half, loss = jnp.asarray([promised, 0.5 * promised, -1.0])
+    np.testing.assert_allclose(damping.after(all_of_it).value, mu / 3)
+    np.testing.assert_allclose(damping.after(half).value, mu)
+    failed = damping.after(loss)
+    np.testing.assert_allclose(failed.value, 2 * mu)
+    failed_again = failed.after(loss)
+    np.testing.assert_allclose(failed_again.value, 2 * 4 * mu)
+    np.testing.assert_allclose(failed_again.growth, 8.0)
 
 
 def test_a_kink_is_a_minimum_but_not_a_standard_error():
