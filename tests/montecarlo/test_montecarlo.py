@@ -305,8 +305,7 @@ LOSSY = Compliant(ji.Bistiffness(1e4, 1.5, 0.6))
 SPEEDS = Uniform([0.0, 0.0, -2.0], [0.0, 0.0, -1.0])
 
 
-SAMPLES = 2100
-CHUNK = 256  # SAMPLES are 8 chunks, and a ninth that is not full
+SAMPLES = 2100  # 8 chunks, and a ninth that is not full
 
 
 def struck(law=LOSSY, samples=SAMPLES, **options):
