@@ -119,18 +119,18 @@ def quasi_lagrange(
         raise ValueError(
             "Argument `system` must not have a moving base for quasi-velocities."
         )
-    at = as_numbers("q", q)
+    place = as_numbers("q", q)
     v = as_numbers("velocity", velocity)
     t = as_numbers("time", time, (), "one instant; vmap over many")
     if constraints is None:
         fixed = 0
     else:
-        fixed = jax.eval_shape(constraints, at).shape[0]
+        fixed = jax.eval_shape(constraints, place).shape[0]
     if contacts is None:
         chosen = None
     else:
         chosen = tuple(contacts)
-    terms = _terms(system, constraints, chosen, at, v, t)
+    terms = _terms(system, constraints, chosen, place, v, t)
     return terms._replace(bilateral=fixed)  # an int: what is jitted returns arrays
 
 

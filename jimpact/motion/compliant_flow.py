@@ -178,12 +178,12 @@ class CompliantFlow(MotionFlow):
         return jnp.concatenate(rows)
 
     def spring_rates(
-        self, const: ContactModes, at: State, contacts: Contacts, force: Forces
+        self, const: ContactModes, state: State, contacts: Contacts, force: Forces
     ) -> Float[Array, "b m"] | tuple[()]:
         """Rates of tangential springs: none, as contacts stick rigidly."""
         return ()
 
-    def sizes_of_springs(self, at: State) -> list[Float[Array, " m"]]:
+    def sizes_of_springs(self, state: State) -> list[Float[Array, " m"]]:
         """Sizes of the rows of tangential springs, of which steps may err by `rtol`:
         none.
         """

@@ -296,11 +296,11 @@ def _after_event(
         run.approach,
     )
     happened = outcome.kind != KIND_CODE["none"]
-    most = jnp.asarray(max_events)
+    limit = jnp.asarray(max_events)
     if problem.past is not None:
-        most = jnp.minimum(problem.past.most, max_events)
+        limit = jnp.minimum(problem.past.most, max_events)
     count = run.event_count
-    full = (count >= most) & happened  # no row is left
+    full = (count >= limit) & happened  # no row is left
     code = jnp.where(full, CODE["max_events"], outcome.status)
     status = jnp.int32(code)
     written = waiting & happened & ~full

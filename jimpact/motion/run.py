@@ -120,9 +120,9 @@ def why_stuck(
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))
     if begin.ndim == 1:
-        least = jnp.min(now / begin)
+        smallest = jnp.min(now / begin)
     else:
         scale = 1 / jnp.sqrt(jnp.diagonal(begin))
         scaled = now * scale[:, None] * scale[None, :]
-        least = jnp.linalg.eigvalsh(scaled)[0]
-    return jnp.where(~(least > _SINGULAR), CODE["singular_mass"], code)
+        smallest = jnp.linalg.eigvalsh(scaled)[0]
+    return jnp.where(~(smallest > _SINGULAR), CODE["singular_mass"], code)

@@ -78,7 +78,7 @@ class SlipAxes(NamedTuple):
 
     along: Float[Array, "m 2"]  # direction d, in the tangents of the body
     speed: Float[Array, " m"]  # |u_0| [m/s], 0 where slip starts
-    least: Float[Array, " m"]  # [m/s] the slip along d counts as at least that
+    smallest: Float[Array, " m"]  # [m/s] the slip along d counts as at least that
     # |u_0| <= LAST of the speed scale: the landing on its end is next
     last: Bool[Array, " m"]
 
@@ -126,8 +126,8 @@ def slip_axes(
 def slip_within(
     axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]
 ) -> Float[Array, "m 2"]:
-    """Directions of slip in the axes of the step: `max(|u . d|, least) d + (u . n) n`,
-    normalized.
+    """Directions of slip in the axes of the step, normalized:
+    `max(|u . d|, smallest) d + (u . n) n`.
 
     It is d where slip begins, or has not started. `rate` is the slip u in these axes
     [m/s].
@@ -138,9 +138,9 @@ def slip_within(
     # behind its end slip counts as in front of it: its direction would be stiff at the
     # least one
     size = jnp.abs(u_d)
-    ahead = jnp.maximum(size, axes.least)
+    ahead = jnp.maximum(size, axes.smallest)
     from_rest = axes.speed == 0
-    small = u_d <= axes.least
+    small = u_d <= axes.smallest
     none = from_rest & small
     begins = modes.sign == BEGINS
     straight = begins | none
@@ -171,7 +171,7 @@ def log_rates(
     axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces
 ) -> Float[Array, " m"]:
     """Rates `(ln |u|)' = u . u' / |u|^2` [1/s] where contacts slide, |u| at least
-    `axes.least`.
+    `axes.smallest`.
 
     0 elsewhere, and where slip is the `last` before its end.
     """
@@ -183,8 +183,8 @@ def log_rates(
     growth = by_contact(acceleration[m:], m)
     u = by_contact(contacts.tangent.rate, m)
     speed_squared = jnp.sum(u * u, axis=1)
-    smallest = axes.least**2
-    square = jnp.maximum(speed_squared, smallest)
+    smallest_square = axes.smallest**2
+    square = jnp.maximum(speed_squared, smallest_square)
     slides = modes.active & ~modes.stick
     has_begun = modes.sign != BEGINS
     slides = slides & ~axes.last & has_begun

@@ -298,8 +298,8 @@ def _friction_of(
     Traced ones below 0 become NaN: the motion is `not_finite` then. ValueError: for
     friction without tangents, or other shapes.
     """
-    own = system.friction is not None
-    if own:
+    of_system = system.friction is not None
+    if of_system:
         mu = system.friction
     else:
         mu = getattr(law, "friction", None)
@@ -314,7 +314,8 @@ def _friction_of(
     if here.tangents is None:
         raise ValueError(
             "Argument `system` must have tangents for the friction of its "
-            f"{'contacts' if own else 'law'}, but its `tangent_function` gives none."
+            f"{'contacts' if of_system else 'law'}, but its `tangent_function` gives "
+            "none."
         )
     if is_traced(mu):
         allowed = mu >= 0
