@@ -60,12 +60,14 @@ class AdmissibleSet:
         closed.
         """
         origin = np.zeros(self.dimension)
-        return self._velocity(self.coordinates.project(origin))
+        nearest = self.coordinates.project(origin)
+        return self._velocity(nearest)
 
     @property
     def least_energy(self) -> float:
         """Least possible T+ [J]."""
-        return float(kinetic_energy(self.scene, self.plastic))
+        energy = kinetic_energy(self.scene, self.plastic)
+        return float(energy)
 
     @cached_property
     def bounds(self) -> np.ndarray:
@@ -76,12 +78,13 @@ class AdmissibleSet:
         """
         # v_i = centre_i + c . u with row c of the axes: v+ where it is least, and
         # greatest
-        ends = [
-            [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)]
-            for c in self.axes
-        ]
-        extremes = enumerate(ends)
-        return np.array([[low[i], high[i]] for i, (low, high) in extremes])
+        lowest = self.coordinates.lowest
+        ranges = []
+        for i, c in enumerate(self.axes):
+            low = self._velocity(lowest(c))
+            high = self._velocity(lowest(-c))
+            ranges.append([low[i], high[i]])
+        return np.array(ranges)
 
     def contains(
         self, velocity: Any, tolerance: float | None = None
@@ -95,18 +98,17 @@ class AdmissibleSet:
         `tolerance` times the size of the impact, `sqrt(2 (T- - T(centre)))`, the
         largest |u|; None: that of `audit`.
         """
-        v = np.asarray(as_float_array("velocity", velocity), float)
-        is_row_or_rows = v.ndim in (1, 2)
-        if not is_row_or_rows or v.shape[-1] != self.scene.size:
+        given = as_float_array("velocity", velocity)
+        v = np.asarray(given, float)
+        if v.ndim not in (1, 2) or v.shape[-1] != self.scene.size:
             raise ValueError(
                 f"Argument `velocity` must have shape ({self.scene.size},) or "
                 f"(k, {self.scene.size}), but has shape {v.shape}."
             )
         check_values("velocity", v)
         check_values("tolerance", tolerance, low=0.0)
-        if tolerance is None:
-            allowed = self.tolerance
-        else:
+        allowed = self.tolerance
+        if tolerance is not None:
             allowed = tolerance
         offset = v - self.centre
         mass = dense_mass(self.scene)
@@ -114,7 +116,8 @@ class AdmissibleSet:
         w = offset - u @ self.axes.T  # violates the momentum balance
         square = np.einsum("...i,ij,...j->...", w, mass, w)
         violation = np.sqrt(np.maximum(square, 0.0))
-        error = np.maximum(self.coordinates.excess(u), violation)
+        outside = self.coordinates.excess(u)
+        error = np.maximum(outside, violation)
         inside = error <= allowed * self._size
         if v.ndim == 1:
             return bool(inside)
@@ -151,10 +154,12 @@ class AdmissibleSet:
         if ends is None:
             return np.zeros((0, self.scene.size))
         angles = np.linspace(*ends, points)
-        arc = self._velocity(self.coordinates.on_circle(angles))
+        circle = self.coordinates.on_circle(angles)
+        arc = self._velocity(circle)
         contact = int(np.argmax(self.scene.closed))
-        first = np.asarray(self.scene.normals)[:, contact]
-        if arc[0] @ first > arc[-1] @ first:
+        normals = np.asarray(self.scene.normals)
+        n = normals[:, contact]
+        if arc[0] @ n > arc[-1] @ n:
             return arc[::-1]
         return arc
 
@@ -170,7 +175,8 @@ class AdmissibleSet:
         """
         self._check_plane()
         as_whole("points", points, 2)
-        return self._velocity(self.coordinates.boundary(points))
+        around = self.coordinates.boundary(points)
+        return self._velocity(around)
 
     def __str__(self) -> str:
         """Table of the set: T+ [J] and, for each coordinate, v- and the range of v+
@@ -276,37 +282,42 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     # one column for each closed contact: qn = unit^T y, its normal in the coordinates y
     normals = np.asarray(scene.normals, float)[:, closed]
     unit = np.linalg.solve(root, normals)
-    unit = unit / np.linalg.norm(unit, axis=0)
+    length = np.linalg.norm(unit, axis=0)
+    unit = unit / length
     size = np.linalg.norm(y)
-    rounding = _APPROACH * np.finfo(scene.mass.dtype).eps
+    eps = np.finfo(scene.mass.dtype).eps
+    rounding = _APPROACH * eps
     approach = unit.T @ y < -rounding * size
     energy = 0.5 * float(y @ y)
     outcomes = partial(AdmissibleSet, scene, start, energy=energy, tolerance=tolerance)
     if not approach.any():
         no_rows = np.zeros((0, 0))
-        alone = CappedPolyhedron(no_rows, np.zeros(0), 0.0)
+        no_bounds = np.zeros(0)
+        alone = CappedPolyhedron(no_rows, no_bounds, 0.0)
         no_axes = np.zeros((len(start), 0))
         return outcomes(centre=start, axes=no_axes, coordinates=alone)
     unit = free @ unit
-    rounding = _SINGULAR * np.finfo(scene.mass.dtype).eps
-    floor = rounding * unit.shape[1]
+    count = unit.shape[1]
+    floor = _SINGULAR * eps * count
     # not contacts that constraints hold
     square = np.sum(unit**2, axis=0)
     unit = unit[:, square > floor]
     basis, singular, _ = np.linalg.svd(unit, full_matrices=False)
-    basis = basis[:, singular**2 > floor]
+    regular = singular**2 > floor
+    basis = basis[:, regular]
     normal = basis.T @ unit  # contacts in the coordinates z = basis^T y
-    before = basis.T @ y
+    z = basis.T @ y  # before the impact
     # gamma+ >= 0: normal^T z >= 0; p >= 0: z - z- in the cone of the normals, facets (z
     # - z-) >= 0
     facets = cone_facets(normal)
     rows = np.vstack([normal.T, facets])
-    of_contacts = np.zeros(normal.shape[1])
-    offset = np.append(of_contacts, facets @ before)
-    redundant = basis.shape[1] < unit.shape[1]
-    radius = float(np.linalg.norm(before))
+    rank, contacts = normal.shape
+    of_contacts = np.zeros(contacts)
+    offset = np.append(of_contacts, facets @ z)
+    redundant = rank < contacts
+    radius = float(np.linalg.norm(z))
     part, centre, axes = capped_polyhedron(rows, offset, radius, redundant)
-    rest = y - basis @ before + basis @ centre  # impulses leave y - basis z- as it is
+    rest = y - basis @ z + basis @ centre  # impulses leave y - basis z- as it is
     centre = np.linalg.solve(root.T, rest)
     axes = np.linalg.solve(root.T, basis @ axes)
     return outcomes(centre=centre, axes=axes, coordinates=part)
@@ -325,11 +336,14 @@ def _constraint_projector(
     if scene.constraints is None:
         return np.eye(len(y))
     constraints = np.asarray(scene.constraints, float)
-    basis, _ = np.linalg.qr(np.linalg.solve(root, constraints))
+    directions = np.linalg.solve(root, constraints)
+    basis, _ = np.linalg.qr(directions)
     violation = np.linalg.norm(basis.T @ y)
-    if violation > tolerance * np.linalg.norm(y):
+    size = np.linalg.norm(y)
+    if violation > tolerance * size:
         raise ValueError(
             f"Argument `velocity` must satisfy the bilateral constraints, grad h^T v = "
-            f"0, but is {np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
+            f"0, but is {violation:.3g} off in the kinetic norm."
         )
-    return np.eye(len(y)) - basis @ basis.T
+    identity = np.eye(len(y))
+    return identity - basis @ basis.T

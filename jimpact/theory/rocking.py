@@ -42,7 +42,8 @@ class RockingRatio(NamedTuple):
     @property
     def restitution(self) -> float:
         """e_theta: the ratio times Housner's value. A conversion, not a fit."""
-        return self.measured_over_housner * float(housner_restitution(self.aspect))
+        housner = float(housner_restitution(self.aspect))
+        return self.measured_over_housner * housner
 
 
 def housner_restitution(aspect: Any) -> jax.Array:
@@ -125,12 +126,10 @@ def rocking_ratios() -> list[RockingRatio]:
     rubber 5.0 0.6313
     concrete 3.0 0.8245
     """
-    rows = (files("jimpact") / "data" / "rocking_ratio.csv").read_text(encoding="utf-8")
-    below_header = rows.splitlines()[1:]
-    lines = [line.split(",") for line in below_header]
-    return [
-        RockingRatio(float(a), material, float(ratio)) for a, material, ratio in lines
-    ]
+    file = files("jimpact") / "data" / "rocking_ratio.csv"
+    _, *rows = file.read_text(encoding="utf-8").splitlines()  # without the header
+    lines = [row.split(",") for row in rows]
+    return [RockingRatio(float(a), name, float(ratio)) for a, name, ratio in lines]
 
 
 class RockingDispersion(eqx.Module):
@@ -170,7 +169,8 @@ class RockingDispersion(eqx.Module):
     @property
     def over_housner(self) -> jax.Array:
         """theta'+ / theta'- over Housner's value (A, B, C)."""
-        return self.angular_ratio / housner_restitution(self.aspect)[:, None, None]
+        housner = housner_restitution(self.aspect)
+        return self.angular_ratio / housner[:, None, None]
 
     def outcomes(self, separation_threshold: float = STAYS) -> np.ndarray:
         """Classes of the impacts (A, B, C), as indices of `OUTCOMES`: which corners
@@ -268,7 +268,8 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     mu = as_numbers("friction", friction, low=0.0)
     slips = jnp.minimum(mu, 0.5**0.5)  # beyond, B sticks
     root = jnp.sqrt(9 * slips**2 + 8)
-    return rocking_kinetic_angle((root - 3 * slips) / 2)
+    aspect = (root - 3 * slips) / 2
+    return rocking_kinetic_angle(aspect)
 
 
 class _BlockImpacts(NamedTuple):
@@ -301,12 +302,13 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> _BlockImpac
         before = jnp.stack([a / 2, sinks, turns])
         with_values = eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e))
         out = impact(with_values, scene, before)
-        after = out.velocity
-        energy = (before**2 * scene.mass).sum() / 2
+        after_x, _, turns_on = out.velocity
+        squares = before**2 * scene.mass
+        energy = squares.sum() / 2
         return _BlockImpacts(
-            gap_velocity=scene.normals.T @ after,
-            angular_ratio=-after[2],
-            slip_velocity=after[0] + a / 2 * after[2],
+            gap_velocity=scene.normals.T @ out.velocity,
+            angular_ratio=-turns_on,
+            slip_velocity=after_x + a / 2 * turns_on,
             energy_ratio=1 + out.energy_change / energy,
             status=out.status,
         )
