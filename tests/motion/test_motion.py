@@ -456,7 +456,7 @@ def test_nested_accumulations_are_passed_below_the_root_of_slow(slides):
     fastest approach; those of a single contact would at slow = 1e-6 of it.
     """
     motion = lane(slides, 4)
-    end = kinds(motion).index("accumulation", 12)  # not the first ones, of one corner
+    end = kinds(motion).index("accumulation", 12)  # after a dozen impacts or more
     velocities = np.asarray(motion.events.velocity_before)[: end + 1]
     _, upwards, turning = velocities.T
     # of the two lower corners, 0.1 m beside the middle; the block tilts by 0.02 at most
