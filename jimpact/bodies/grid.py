@@ -394,7 +394,7 @@ def active_pairs(
         """
         used, chosen = chosen_rows(closed_up_to, first, count)
         chosen = jnp.where(used, numbers[chosen], 0)
-        i, j, directions = _of_contacts(bodies, q, chosen)
+        i, j, directions = _bodies_and_directions(bodies, q, chosen)
         between = jnp.stack([i, j], axis=1)
         number = jnp.where(used, chosen, no_contact)
         between = jnp.where(used[:, None], between, 0)
@@ -418,21 +418,23 @@ def active_pairs(
     )
 
 
-def _of_contacts(
+def _bodies_and_directions(
     bodies: Pile, q: jax.Array, number: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Bodies i and j (K,) of the contacts of these numbers (K,), and their directions,
-    at q.
+    """Bodies i and j (K,) of the contacts of these numbers (K,), and their directions
+    (K, d, 2, velocities) at q.
 
-    j is the number of bodies for a plane; directions (K, d, 2, velocities) as of
-    `ActivePairs`.
+    A number is `(i stride + partner) slots + slot`: a partner below the number of
+    bodies is j, with a slot for each point of the pair; beyond, it counts the corners
+    of i at each plane in turn, and j is the number of bodies. Directions are as of
+    `ActivePairs`; the second one of a contact with a plane is not used.
     """
     slots_of_pair = jnp.int32(slots(bodies))
     partners = jnp.int32(stride(bodies))
     pair, slot = jnp.divmod(number, slots_of_pair)
-    i, partner = jnp.divmod(pair, partners)  # see `_closed`
-    last = bodies.count - 1
-    other = jnp.minimum(partner, last)
+    i, partner = jnp.divmod(pair, partners)
+    # of a plane the last body, whose direction is not used
+    other = jnp.minimum(partner, bodies.count - 1)
     row = np.arange(len(number))
     places = bodies.of_bodies(q)
     _, points, normals = _pair_contacts(bodies, places, i, other)

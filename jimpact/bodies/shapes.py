@@ -667,8 +667,10 @@ def _round_shape(
     """`Shape` of a disc or sphere, and its middle (d,) [m] from the centre of mass,
     `-centre`.
 
-    `radius` [m], `centre` of mass from the middle (d,) [m] or None; `isotropic`: equal
-    moments of inertia about all axes.
+    `radius` [m], `centre` of mass from the middle (d,) [m], None: the middle;
+    `isotropic`: equal moments of inertia about all axes. The shape is `centred` if it
+    is isotropic about its middle: no turn changes it then. A ValueError of a centre
+    outside the radius, where both are known.
     """
     middle = jnp.zeros(d, radius.dtype)
     if centre is not None:
@@ -680,7 +682,9 @@ def _round_shape(
                 f"middle, but has value {(-middle).tolist()}."
             )
     centred = isotropic and centre is None
-    return Shape((0,), 1, faces=False, centred=centred), middle
+    # its only point is the middle, which touches planes at the distance of the radius
+    shape = Shape(order=(0,), size=1, faces=False, centred=centred)
+    return shape, middle
 
 
 def _dimer(

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -145,10 +145,9 @@ def law_of(
     folder: Path,
     scene: Scene | None = None,
 ) -> tuple[Law, dict[str, Any], Fitted]:
-    """Law of a study, values of its parameters, and statements on its fit, from checked
-    tables.
+    """Law of a study, values of its parameters, and what it says on its fit.
 
-    The tables are [law], [law.bounds], [law.priors] and [fit].
+    The tables [law], [law.bounds], [law.priors] and [fit] are checked on the way.
 
     Args:
         tables: of the study.
@@ -157,8 +156,13 @@ def law_of(
         folder: of the study, in which a module may lie that registers its law.
         scene: for a `RestitutionMatrix` without its matrix, which starts from an
             admissible one.
+
+    Raises:
+        ValueError: keys, or values, that the law or the fit does not have.
+        WrongOption: `other_law` is no law.
     """
     table = tables["law"]
+    # that it has a name; its other keys once the law is known
     check_keys("[law]", table, tuple(table), required=("name",))
     if "module" in table:
         import_laws(str(table["module"]), folder)
@@ -169,17 +173,8 @@ def law_of(
         check_choice("law", name, REGISTRY)
     except ValueError as error:
         raise WrongOption(str(error)) from None
-    others = ("name", "module", "bounds", "priors")
-    check_keys("[law]", table, (*REGISTRY[study_law].arguments, *others))
     not_of_law = (*OF_A_SCENE, *OF_A_MOTION)
-    allowed = (*REGISTRY[study_law].parameters, *not_of_law)
-    for key in ("bounds", "priors"):
-        pairs = table.get(key, {})
-        if isinstance(pairs, dict):
-            fields = {entry_of(x)[0]: x for x in pairs}
-        else:
-            fields = pairs
-        check_keys(f"[law.{key}]", fields, allowed)
+    _check_table_of_law(table, study_law, not_of_law)
     row = REGISTRY[name]
     values = {key: x for key, x in table.items() if key in row.arguments}
     if row.law is RestitutionMatrix and "matrix" not in values and scene is not None:
@@ -189,7 +184,7 @@ def law_of(
     options = dict(tables.get("fit", {}))
     check_keys("[fit]", options, FIT)
     free = _masks(options.pop("free", []))
-    values = _with_exponent(values, free)
+    values = _with_exponent_as_used(values, free)
 
     def kept(pairs: Mapping[str, Any]) -> dict[str, Any]:
         """The pairs whose parameter the law has; all if it is the study's own."""
@@ -202,9 +197,12 @@ def law_of(
 
     law = row.build(**values)
     free = kept(free)
-    own = {x: choice for x, choice in free.items() if entry_of(x)[0] not in not_of_law}
-    if own:  # refuse what this law does not have, whether or not it will be fitted
-        free_parameters(law, own, absolute=True)
+    free_of_law = {
+        x: choice for x, choice in free.items() if entry_of(x)[0] not in not_of_law
+    }
+    # refuses what this law does not have, whether or not it will be fitted
+    if free_of_law:
+        free_parameters(law, free_of_law, absolute=True)
     bounds = kept(table.get("bounds", {}))
     priors = kept(table.get("priors", {}))
     return law, values, Fitted(free, bounds, priors, options)
@@ -223,7 +221,27 @@ def _masks(free: Any) -> dict[str, Any]:
     )
 
 
-def _with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
+def _check_table_of_law(
+    table: Mapping[str, Any], law: str, not_of_law: Sequence[str]
+) -> None:
+    """Raise a ValueError for keys of [law], [law.bounds] and [law.priors] that a law of
+    this name does not have; `not_of_law`: what bounds and priors may have besides.
+    """
+    not_parameters = ("name", "module", "bounds", "priors")
+    check_keys("[law]", table, (*REGISTRY[law].arguments, *not_parameters))
+    allowed = (*REGISTRY[law].parameters, *not_of_law)
+    for key in ("bounds", "priors"):
+        pairs = table.get(key, {})
+        if isinstance(pairs, dict):
+            fields = {entry_of(x)[0]: x for x in pairs}
+        else:
+            fields = pairs  # no table, which `check_keys` refuses
+        check_keys(f"[law.{key}]", fields, allowed)
+
+
+def _with_exponent_as_used(
+    values: dict[str, Any], free: Mapping[str, Any]
+) -> dict[str, Any]:
     """A law's values with the exponent as an array if it is free, else as numbers:
     faster.
     """

@@ -138,7 +138,9 @@ def impact(
             constraint). An energy of the impact,
             `sum gamma-^2 / W_jj`, that the floating type takes for 0 or infinite is
             `out_of_range` on the host, too: choose other units.
-            Warns where only open contacts approach and the law leaves those out.
+
+    Warns:
+        UserWarning: only open contacts approach, and the law leaves those out.
 
     >>> import jimpact as ji
     >>> out = ji.impact(
@@ -173,6 +175,7 @@ def impact(
     groups = None
     if is_separable(law):
         groups = coupled_groups(scene)
+    # small scenes are padded to common sizes, so that few programs serve all
     if groups is None and _shares_a_program(law, scene, v, given):
         return _impact_of_padded_scene(law, scene, v, given)
     with naming_the_adjoint():

@@ -92,7 +92,11 @@ Exponent = float | tuple[float, ...] | jax.Array
 
 
 def power(x: Float[Array, "m *B"], exponent: Exponent) -> Float[Array, "m *B"]:
-    """`max(x, 0)^exponent`, with finite derivatives at 0; fast for static halves."""
+    """`max(x, 0)^exponent` of exponents >= 1, with finite derivatives at 0.
+
+    A static one, or a tuple of equal ones, that is a multiple of 1/2 below LARGE is a
+    product of factors x and sqrt(x), which is faster than `exp(eta log x)`.
+    """
     if isinstance(exponent, tuple) and len(set(exponent)) == 1:
         exponent = exponent[0]
     if isinstance(exponent, float) and exponent == 1.0:
@@ -625,8 +629,9 @@ class ContactFlow(Flow):
             EXPANSION     x                           g
             YIELD         1                           -g
 
-        Where forces slacken, by indentation the onset in COMPRESSION, minus the onset
-        in SLACK; by velocity x in both.
+        Where forces slacken, as only laws with gaps do, these take their place: by
+        indentation `onset` in COMPRESSION and `-onset` in SLACK, by velocity x in both.
+        `onset` > 0 while spring and damper together press.
         """
         x, g, _ = self.rows(y)
         phase = self.modes(modes).phase

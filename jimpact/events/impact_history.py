@@ -116,11 +116,11 @@ class HistoryProgram:
         )
         last = flow.contact_states(end.carry.step.modes, end.reached).force
         over = t >= time_of(end.reached)[None]
-        samples = (
-            self.fractions(y.dtype),
-            jnp.where(over, end.reached[None], end.seen.states),
-            jnp.where(over, end.carry.step.modes[None], end.seen.modes),
-            jnp.where(over, 0.0, end.seen.clock),
+        samples = Sample(
+            fraction=self.fractions(y.dtype),
+            begin=jnp.where(over, end.reached[None], end.seen.states),
+            modes=jnp.where(over, end.carry.step.modes[None], end.seen.modes),
+            clock=jnp.where(over, 0.0, end.seen.clock),
         )
         time, energy, contacts = jax.lax.map(partial(_sampled, flow, end), samples)
         is_last = last > end.seen.force
@@ -128,14 +128,24 @@ class HistoryProgram:
         return time, energy, *contacts, force, end.status.astype(y.dtype)
 
 
-def _sampled(
-    flow: ContactFlow, end: ImpactEnd, sample: Any
-) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
-    """Time, twice the energy and contact states of a sample, by one more step.
+class Sample(NamedTuple):
+    """Where a sample lies: its time over the duration; state, modes and clock of the
+    step that contains it, at the beginning of that step.
+    """
 
-    `sample`: its time over the duration, then state, modes and clock of the step that
-    it lies in. That step goes `ahead` in the flow's own time. Indentations of open
-    contacts are 0.
+    fraction: Float[Array, ""]
+    begin: Float[Array, "n B"]
+    modes: Int[Array, "modes B"]
+    clock: Float[Array, "clock B"]
+
+
+def _sampled(
+    flow: ContactFlow, end: ImpactEnd, sample: Sample
+) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
+    """Time, twice the energy of the springs, and contact states of a sample, by one
+    more step.
+
+    The step goes `ahead` in the flow's own time. Indentations of open contacts are 0.
     """
     fraction, begin, modes, clock = sample
     since = fraction * time_of(end.reached) - time_of(begin)
@@ -146,7 +156,7 @@ def _sampled(
     state = stepper.between(flow, step, begin, ahead)
     contacts = flow.contact_states(modes, state)
     x = jnp.maximum(contacts.indentation, 0.0)
-    energy = flow.energy(x, jnp.zeros_like(x))
+    energy = flow.energy(x, g=jnp.zeros_like(x))  # without the kinetic one
     return time_of(state), energy, contacts._replace(indentation=x)
 
 

@@ -501,7 +501,8 @@ class SlipFlow(FrictionFlow):
             tangential_impulse=self.side_impulse(y),
             slip=flat(u),
             tangential_energy=y[:0],  # no rows
-            rate=const.frozen.unit / motion.haste,  # as that of time in `field`
+            # as that of time in `field`, whose independent variable runs ahead
+            rate=const.frozen.unit / motion.haste,
         )
 
     def field(
@@ -665,55 +666,67 @@ class SlipFlow(FrictionFlow):
         stopped: Bool[Array, "m B"],
         closed: Bool[Array, "m B"],
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state once it is decided which contacts stick, and where others
-        creep to.
+        """Modes and state after contacts have `closed`, or their slip has `stopped`.
 
-        A contact that has `closed` with slip slips along it: its Cartesian rows become
-        ln r and angle. `distribute` decides anew where slip has `stopped`, or a contact
-        has `closed` without slip, from the forces of a moment later: of these contacts,
-        of those that stick, and of those below REST.
+        A contact that closed with slip slips along it: its Cartesian rows become ln r
+        and angle. If any contact of an impact stopped, or closed at rest (slip up to
+        REST of the tolerance), all its loaded contacts that stopped, rest or stick are
+        asked: by the forces of a moment later they stick, or creep in the direction of
+        u'. The slip of a contact that closed at rest is taken by an impulse at once.
+        Decisions have no derivatives.
         """
         q = self.slip(y)
         slip = self.modes(modes).slip
         loaded = self.loaded(modes)
         stick = loaded & (slip == Slip.STICKS) & ~closed
-        speed = self.speed(modes, q)
-        r = jnp.where(closed, length(q), speed)
-        resting = loaded & (r <= REST * self.tolerance) & ~stick
+        slip_speed = jnp.where(closed, length(q), self.speed(modes, q))
+        resting = loaded & (slip_speed <= REST * self.tolerance) & ~stick
         slips = closed & ~resting
-        u = jnp.where(slips[:, None], q, 1.0)
-        log_r = jnp.log(length(u))
-        of_slip = jnp.stack([log_r, angle_of(u)], 1)
-        q = jnp.where(slips[:, None], of_slip, q)
+        q = _slipping(q, slips)
         slip = jnp.where(slips, Slip.SLIPS, slip)
-        check = any_of(stopped | (closed & resting))
-        to_check = check & loaded & (stopped | resting | stick)
+        closed_at_rest = closed & resting
+        decides = any_of(stopped | closed_at_rest)
+        asked = decides & loaded & (stopped | resting | stick)
+        cone, inside, angle = self._distributed(modes, y, q, asked)
+        begins = jnp.stack([jnp.zeros_like(angle), angle], 1)  # r = 0
+        lost = jnp.where(closed_at_rest[:, None], q, 0.0)
+        q = jnp.where(asked[:, None], begins, q)
+        answer = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
+        modes = self.with_slip_modes(modes, jnp.where(asked, answer, slip))
+        pressed = asked & (cone > 0)
+        held = pressed & inside
+        begun = pressed & closed_at_rest & ~inside
+        with_slip = self.with_slip(y, q)
+        return modes, self._without_slip(modes, with_slip, lost, held, begun)
+
+    def _distributed(
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        q: Float[Array, "m 2 B"],
+        asked: Bool[Array, "m B"],
+    ) -> tuple[Float[Array, "m B"], Bool[Array, "m B"], Float[Array, "m B"]]:
+        """Of the contacts that are `asked`, by the forces of a moment later: mu F, who
+        sticks (`inside` the cone), and the angle of u' of those that do not.
+
+        Contacts that slide on keep their direction, the angle in `q`. Constants: which
+        contacts stick has no derivative.
+        """
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
         cone = constant.friction * f  # mu F
         # b = u' by normal forces and by the friction of contacts that slide on
         _, angle = parts(q)
         along, _ = polar(jax.lax.stop_gradient(angle))
-        open_or_asked = (to_check | ~loaded)[:, None]
-        sliding = jnp.where(open_or_asked, 0.0, along)
+        not_sliding = (asked | ~self.loaded(modes))[:, None]
+        sliding = jnp.where(not_sliding, 0.0, along)
         b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f)
         force_of_sliding = flat(cone[:, None] * sliding)
         b = b - times(constant.tangent, force_of_sliding)
-        inside, towards = distribute(constant.tangent, b, cone, to_check)
-        angle = jnp.where(inside, 0.0, angle_of(pairs(towards)))
-        begins = jnp.stack([jnp.zeros_like(angle), angle], 1)  # r = 0
-        to_lose = (closed & resting)[:, None]
-        lost = jnp.where(to_lose, q, 0.0)
-        q = jnp.where(to_check[:, None], begins, q)
-        checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
-        modes = self.with_slip_modes(modes, jnp.where(to_check, checked, slip))
-        pressed = to_check & (cone > 0)
-        held = pressed & inside
-        begun = pressed & closed & resting & ~inside
-        with_slip = self.with_slip(y, q)
-        return modes, self._stopped(modes, with_slip, lost, held, begun)
+        inside, towards = distribute(constant.tangent, b, cone, asked)
+        return cone, inside, jnp.where(inside, 0.0, angle_of(pairs(towards)))
 
-    def _stopped(
+    def _without_slip(
         self,
         modes: Int[Array, "modes B"],
         y: Float[Array, "n B"],
@@ -721,15 +734,16 @@ class SlipFlow(FrictionFlow):
         held: Bool[Array, "m B"],
         begun: Bool[Array, "m B"],
     ) -> Float[Array, "n B"]:
-        """The state after slips `lost`, whose values are 0, have been taken from
-        contacts `held`, and from those that have `begun` to slide.
+        """The state after friction has taken the slips `lost` at once, see
+        `_impulse_that_takes_slip`: `dgamma = K_nt p_t`, `du = K_tt p_t`.
 
-        As in the plane it changes tangents alone: by the tangential impulse p_t that
-        takes the slips (`_impulse_of_rest`), `dgamma = K_nt p_t`, `du = K_tt p_t`.
+        Of contacts `held`, and of those that have `begun` to slide. The slips are below
+        the tolerance, so their values count as 0; as in the plane it is derivatives
+        that the impulse changes.
         """
         state = self.friction_rows(y)
         q = self.slip(y)
-        p_t = self._impulse_of_rest(q, lost, held, begun)
+        p_t = self._impulse_that_takes_slip(q, lost, held, begun)
         p_t = p_t - jax.lax.stop_gradient(p_t)
         dg = self.as_rows(modes, times(self.normal_tangent, p_t))
         du = pairs(times(self.tangent, p_t))
@@ -738,18 +752,20 @@ class SlipFlow(FrictionFlow):
         state = state._replace(g=state.g + dg, u=u, side=state.side + p_t)
         return state.packed()
 
-    def _impulse_of_rest(
+    def _impulse_that_takes_slip(
         self,
         q: Float[Array, "m 2 B"],
         lost: Float[Array, "m 2 B"],
         held: Bool[Array, "m B"],
         begun: Bool[Array, "m B"],
     ) -> Float[Array, "t B"]:
-        """p_t with `lost + K_tt p_t = 0` in contacts `held`; in contacts that have
-        `begun` to slide across their direction alone, which friction takes at once.
+        """Tangential impulse p_t of friction that takes the slip `lost` at once.
 
-        In the basis E of each contact, (d, n) of one that has begun, else its tangents:
-        `p_t = E z`, `z = -(E^T K_tt E)^+ E^T lost` in these rows.
+        Contacts `held` come to rest, `lost + K_tt p_t = 0` along both tangents. Those
+        that have `begun` to slide keep what they have along their direction (the angle
+        in `q`), and lose what is across it. In the basis E of each contact, (along,
+        across) of one that has begun, else its tangents: `p_t = E z`,
+        `z = -(E^T K_tt E)^+ E^T lost` in these rows.
         """
         m = self.contacts
         _, angle = parts(q)
@@ -787,3 +803,14 @@ class SlipFlow(FrictionFlow):
         free = ~self.loaded(modes)
         dq = jnp.where(free[:, None], du, 0.0)
         return jnp.where(slides[:, None], polars, dq)
+
+
+def _slipping(
+    q: Float[Array, "m 2 B"], slips: Bool[Array, "m B"]
+) -> Float[Array, "m 2 B"]:
+    """Rows of slip in which the Cartesian slip u of contacts that begin to slip becomes
+    ln |u| and its angle.
+    """
+    u = jnp.where(slips[:, None], q, 1.0)
+    of_slip = jnp.stack([jnp.log(length(u)), angle_of(u)], 1)
+    return jnp.where(slips[:, None], of_slip, q)

@@ -180,19 +180,21 @@ class DataBalances:
     ) -> dict[int, float]:
         """Ratios, by shot, of the balances that fail by more than the noise.
 
-        With sigma: an excess beyond a multiple of its standard error. Without: more
-        than `DEFECT_TOLERANCE` of the scale, if t tests show that the shots have an
-        excess in common, in proportion to its standard error, or to the momentum or
-        energy before; or if half of the defects are beyond `GROSS`, or there is one
-        shot; or, of gains, those that are outliers.
+        With sigma: an excess beyond a multiple of its standard error. Without: one of
+        more than `DEFECT_TOLERANCE` of the scale; all of these if there is one shot, or
+        half of the shots are beyond `GROSS`; else, of gains, the outliers alone if
+        there are any; else all if a t test shows an excess in common, in proportion to
+        its standard error, or to the momentum or energy before; else none.
 
         Args:
             defects: of one momentum, or of the energy, one for each shot.
             level: how often honest shots may be reported together.
             gains: only excesses > 0 count.
         """
-        rows = np.array(defects).reshape(-1, 6)
-        _, excess, scale, before, _, error = rows.T
+        excess = np.array([d.excess for d in defects])
+        scale = np.array([d.scale for d in defects])
+        before = np.array([d.before for d in defects])
+        error = np.array([d.error for d in defects])
         if gains:
             size = excess
         else:
@@ -200,9 +202,8 @@ class DataBalances:
         has_sigma = self.experiments.sigma is not None
         count = max(len(defects), 1)
         sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / count)))
-        beyond = size > (sigmas * error if has_sigma else DEFECT_TOLERANCE * scale)
-        pairs = zip(defects, beyond)
-        flagged = {d.k: d.ratio for d, far in pairs if far}
+        is_far = size > (sigmas * error if has_sigma else DEFECT_TOLERANCE * scale)
+        flagged = {d.k: d.ratio for d, far in zip(defects, is_far) if far}
         if (
             has_sigma
             or len(defects) < 2
@@ -219,7 +220,7 @@ class DataBalances:
         has_error = error > 0
         weight = 1 / error[has_error]
         # excess / error is compared with a constant, and with before / error
-        shapes = np.sign(weight), weight * before[has_error]
+        shapes = np.ones_like(weight), weight * before[has_error]
         weighted = weight * excess[has_error]
         chance = min(_p_value(weighted, shape, gains) for shape in shapes)
         if chance < level / len(shapes):
@@ -227,28 +228,32 @@ class DataBalances:
         return {}
 
     def _gain_outliers(self, gains: list[_Defect]) -> set[int]:
-        """Indices of shots whose gain of energy is an outlier among all shots, without
-        sigma.
+        """Indices of shots whose gain of energy is an outlier among all shots, of
+        experiments without sigma.
 
         Excesses over their standard errors (of a sigma of 1 m/s) scatter by the noise
-        about their median; the noise is the root mean square of `_shorter_half` of
-        energy and momenta, which outliers hardly change. The limit is that of Student's
-        t above the median, and at least that of the noise above 0 at DEFECT_LEVEL.
+        about their median; the noise is the root mean square of the sigmas of energy
+        and momenta by their shorter half, which outliers hardly change. An outlier is
+        above the median by Student's t of OUTLIER_LEVEL, shared among the shots, times
+        the noise, and above 0 by the normal quantile of DEFECT_LEVEL times the noise.
+        Without degrees of freedom there is none.
         """
         groups = [gains, *self.momenta.values()]
-        values = [
+        ratios = [
             np.array([d.excess / d.error for d in each if d.error > 0])
             for each in groups
         ]
-        squares = [_shorter_half(each) ** 2 for each in values if len(each)]
+        of_gains, *_ = ratios
+        squares = [_sigma_by_shorter_half(each) ** 2 for each in ratios if len(each)]
         noise = np.sqrt(np.mean(squares))
-        degrees_of_freedom = sum(len(each) - 1 for each in values if len(each))
-        freedom = _EFFICIENCY_OF_HALF * degrees_of_freedom
-        if freedom == 0:
+        degrees_of_freedom = sum(len(each) - 1 for each in ratios if len(each))
+        effective_freedom = _EFFICIENCY_OF_HALF * degrees_of_freedom
+        if effective_freedom == 0:
             return set()
-        apart = noise * float(stdtrit(freedom, 1 - OUTLIER_LEVEL / len(gains)))
+        share = OUTLIER_LEVEL / len(gains)
+        apart = noise * float(stdtrit(effective_freedom, 1 - share))
         of_level = noise * float(ndtri(1 - DEFECT_LEVEL))
-        least = max(of_level, np.median(values[0]) + apart)
+        least = max(of_level, np.median(of_gains) + apart)
         return {d.k for d in gains if d.error > 0 and d.excess / d.error > least}
 
 
@@ -418,7 +423,7 @@ def _approaches(normals: np.ndarray, before: np.ndarray) -> bool:
 DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)
 
 
-def _shorter_half(values: np.ndarray) -> float:
+def _sigma_by_shorter_half(values: np.ndarray) -> float:
     """Robust standard deviation: 1.4826 / 2 times the length of the shortest half of
     the values.
 

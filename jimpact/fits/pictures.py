@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact.fits.profiles import Contour
-from jimpact.fits.report import Fit
+from jimpact.fits.report import Fit, of_bodies
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -168,8 +168,8 @@ def _error_bars(fit: Fit) -> np.ndarray | None:
 
 
 def _label_shots(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
-    """Label the x axis: bodies, at the offsets `dodge`, for a single shot; else shots
-    or values.
+    """Label the x axis: of a single shot bodies, or coordinates, at the offsets
+    `dodge`; else shots, or values.
 
     At most `_LABELLED` of them have a label.
     """
@@ -177,7 +177,7 @@ def _label_shots(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     labels = fit.problem.labels
     if data is not None and len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
-        axes.set_xlabel("body")
+        axes.set_xlabel("body" if of_bodies(fit) else "coordinate")
         axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
         return
     stride = -(-len(labels) // _LABELLED)

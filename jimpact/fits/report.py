@@ -189,8 +189,20 @@ def _with_error(fit: "Fit", i: int) -> str:
     return f"{text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 
+def of_bodies(fit: "Fit") -> bool:
+    """True if each coordinate of a fit to shots is a body, as those of a chain are."""
+    data = fit.experiments
+    if data is None:
+        return False
+    return data.largest_scene(fit.problem.scene).walls is not None
+
+
 def _headline(fit: "Fit") -> str:
-    """First line of the report: the law, the number of measured values, the method."""
+    """First line of the report: the law, shots and bodies, the number of measured
+    values, the method.
+
+    Coordinates are bodies in a chain alone; elsewhere they are coordinates.
+    """
     measured = np.isfinite(fit.problem.measured)
     law = type(fit.law).__name__
     values = int(measured.sum())
@@ -201,9 +213,10 @@ def _headline(fit: "Fit") -> str:
         count = f"{values}"
     else:
         count = f"{values} of {measured.size}"
-    one_unit = len(set(fit.experiments.units)) == 1
-    words = ("body", "bodies") if one_unit else ("coordinate",)
-    what = counted(size, *words)
+    if of_bodies(fit):
+        what = counted(size, "body", "bodies")
+    else:
+        what = counted(size, "coordinate")
     seen = f"{count} {'velocity' if measured.size == 1 else 'velocities'} measured"
     return f"Fit of {law} to {counted(shots, 'shot')} of {what} ({seen}), {fit.method}"
 
@@ -451,10 +464,10 @@ def _shots(fit: "Fit") -> list[str]:
         common_unit = ""
     else:
         common_unit = f" [{data.units[0]}]"
-    if mixed:
-        which = "coord"
-    else:
+    if of_bodies(fit):
         which = "body"
+    else:
+        which = "coord"
     shots, bodies = data.pre.shape
     shown = max(1, _VELOCITIES_SHOWN // bodies)
     wide = max(8, *map(len, data.shots[:shown]))

@@ -173,7 +173,9 @@ class Binary(Law):
             return tuple(range(m))
         return None
 
-    def _gaps(self, gaps: jax.Array | None, gamma: jax.Array) -> jax.Array | None:
+    def _gaps_that_order(
+        self, gaps: jax.Array | None, gamma: jax.Array
+    ) -> jax.Array | None:
         """Gaps (m,) [m] in the order 'earliest', 0 where none are given; None in other
         orders.
         """
@@ -198,20 +200,18 @@ class Binary(Law):
     def _solve(
         self, contact: Contact
     ) -> tuple[jax.Array, jax.Array | None, collisions.SequenceEnd]:
-        """Impulses p (m,), p_t (t,) [N s], with the status code and number of
-        collisions.
+        """Impulses p (m,), p_t (t,) [N s] (None without friction) of one collision
+        after the other, in the order of the law; how they ended.
         """
         gamma = contact.gap_velocity
-        gaps = self._gaps(contact.gaps, gamma)
-        cycle = self._cycle(gamma.shape[0])
         return collisions.solve(
             contact.delassus,
             gamma,
             self.restitution,
-            gaps,
-            cycle,
-            self.max_collisions,
-            self._friction(contact),
+            gaps=self._gaps_that_order(contact.gaps, gamma),
+            cycle=self._cycle(gamma.shape[0]),
+            max_collisions=self.max_collisions,
+            friction=self._friction(contact),
         )
 
     def collisions(self, scene: Scene, velocity: Any) -> jax.Array:
@@ -256,7 +256,7 @@ class Binary(Law):
         contact = law.contact(scene, v)
         w = contact.delassus
         gamma = contact.gap_velocity
-        gaps = law._gaps(contact.gaps, gamma)
+        gaps = law._gaps_that_order(contact.gaps, gamma)
         friction = law._friction(contact)
         inputs = collisions.to_inputs(w, gamma, law.restitution, gaps, friction)
         options = collisions.Options(

@@ -363,7 +363,7 @@ def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
     occurring = np.unique(np.concatenate(codes))
     patches = [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring]
-    legend_below(figure, 4, patches)
+    legend_below(figure, columns=4, handles=patches)
 
 
 @styled(ValidityMap)

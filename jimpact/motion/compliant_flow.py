@@ -202,8 +202,8 @@ class CompliantFlow(MotionFlow):
     def margins(
         self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
     ) -> Float[Array, "margins 1"]:
-        """Rows of `_normal_margins`, with friction of `friction_margins`, and of the
-        sample.
+        """Margins that are >= 0 while all contacts keep their modes, in `const`: those
+        of normals, with friction those of tangents, and that of the next sample.
         """
         state = unpacked(self.like, y)
         x = state.contact[0]
@@ -212,16 +212,22 @@ class CompliantFlow(MotionFlow):
         if mu is None:
             normal, _ = kinematics(self.system, state.q, state.v, state.t)
             margins = self._normal_margins(phase, normal.rate, x)
-            return self.from_margins(margins, state)
+            return self.with_margin_of_sample(margins, state)
         contacts, force = self.contact_forces(const, state)
         gamma = contacts.normal.rate
         by_normal = self._normal_margins(phase, gamma, x)
         zero = jnp.zeros_like(state.t)
-        one = zero + 1
-        scale = self.scales.slip
-        by_friction = friction_margins(contacts, mu, friction, force, one, zero, scale)
+        by_friction = friction_margins(
+            contacts,
+            mu,
+            friction,
+            force,
+            lasts=zero + 1,
+            slack=zero,
+            speed_scale=self.scales.slip,
+        )
         margins = jnp.concatenate([by_normal, by_friction])
-        return self.from_margins(margins, state)
+        return self.with_margin_of_sample(margins, state)
 
     def _normal_margins(
         self, const: Int[Array, " m"], rate: Float[Array, " m"], x: Float[Array, " m"]

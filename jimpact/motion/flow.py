@@ -246,7 +246,7 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """1: margins are in units of their rounding."""
         return jnp.ones((1, 1), self.sizes.dtype)
 
-    def from_margins(
+    def with_margin_of_sample(
         self, margins: Float[Array, " k"], state: State
     ) -> Float[Array, "margins 1"]:
         """Rows of margins, that of the next sample `t_sample - t` last, over their
@@ -447,7 +447,7 @@ class MechanicalFlow(MotionFlow):
         margins = contact_margins(
             contacts, self.mu, const, self.scales, self.below, slip
         )
-        return self.from_margins(margins, state)
+        return self.with_margin_of_sample(margins, state)
 
     def projected(self, const: Modes, state: State) -> tuple[State, Bool[Array, " m"]]:
         """Gaps, gap velocities and slip that the modes hold set to 0: the least change

@@ -300,7 +300,7 @@ class SpringMotionFlow(CompliantFlow):
             dragging = drags / scale
             parts.append(jnp.where(slides, dragging, 1.0))
         margins = jnp.concatenate(parts)
-        return self.from_margins(margins, state)
+        return self.with_margin_of_sample(margins, state)
 
     def _sinking(self, const: SpringModes, contacts: Contacts) -> Float[Array, " m"]:
         """Rate x' [m/s] of the indentations."""

@@ -759,16 +759,16 @@ def _brought_to_rest(
 
 
 def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Passed:
-    """Time and gap of the hops that a stop leaves out, from its energy and what the
-    impact `lost`.
+    """Time [s] and height [m] of the hops that a stop leaves out.
 
-    Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E
-    lifts it by E / F at most. If each impact keeps r^2 of the energy, and k contacts
-    strike in turn, hops take `2 k p / F (1 + r + ..)` together: exact for a single
-    contact. r^2 is the energy [J] that the stop takes, over itself and `lost`, that of
-    the last impact; `ends`: the k contacts.
+    `ends`: the k contacts that stop. Under the force F that will keep one closed a hop
+    takes 2 p / F, and the energy E that the stop takes lifts it by E / F at most; the
+    longest hop and the highest lift count. `lost` [J] is the loss of the last impact:
+    an impact keeps `r^2 = E / (E + lost)` of the energy. Hops of k contacts that strike
+    in turn take `2 k p / F (1 + r + r^2 + ..) = 2 k p / F / (1 - r)`: exact for one
+    contact. Both are 0 where nothing is pressed, or no energy is left.
     """
-    p = stop.impulse[: len(ends)]
+    p = stop.impulse[: len(ends)]  # those along the normals come first
     energy = stop.energy
     has_force = stop.force > 0
     pressed = ends & has_force

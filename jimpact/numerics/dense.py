@@ -463,9 +463,12 @@ def load_shares(
     """Weights `limit_j / max_k limit_k` of the contacts in the sharing of redundant
     forces.
 
-    None is below `least`, which keeps the weights of contacts without load regular.
+    `limit` >= 0: the largest force of each contact, mu F of friction. No weight is
+    below `least`, which keeps those of contacts without load regular; all are `least`
+    where none has a load.
     """
     largest = jnp.max(limit, axis=0, keepdims=True)
+    # forces are shared alike whatever all weights are multiplied by
     largest = jax.lax.stop_gradient(largest)
     some = largest > 0
     share = limit / jnp.where(some, largest, 1.0)

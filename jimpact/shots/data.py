@@ -441,19 +441,21 @@ class Experiments(eqx.Module):
         return np.array([max(approach, 0.0) for approach in approaches])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """Errors (n,) of equal weight in a scene: 1 m/s, and those rad/s of as much
-        energy.
+        """Errors (n,) of equal weight in a scene: 1 m/s, and the rad/s of as much
+        energy; 1 for all where units are alike.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in
-        rad/s)`.
+        rad/s)`, means over shots and coordinates; `scene` None: the scenes of the
+        shots.
         """
         turns = np.array(self.units) == ANGULAR
         if turns.all() or not turns.any():
             return np.ones(len(turns))
         diagonals = [np.diag(mass) for mass in self.each(scene, dense_mass)]
         masses = np.mean(diagonals, axis=0)
-        arm = np.sqrt(masses[~turns].mean() / masses[turns].mean())
-        return np.where(turns, arm, 1.0)
+        # [rad/s] of as much energy as 1 m/s
+        turning = np.sqrt(masses[~turns].mean() / masses[turns].mean())
+        return np.where(turns, turning, 1.0)
 
     def balances(
         self, scene: Scene | None

@@ -174,13 +174,13 @@ class Explained(NamedTuple):
     """What explains the residuals of one coordinate in its flights.
 
     Fields: the most likely errors; `bent` (F,), where flights have an acceleration of
-    their own; that of all flights; `mostly`: most frames are in flights that bend.
+    their own; that of all flights; `most_bend`: most frames are in flights that do.
     """
 
     errors: Likely
     bent: np.ndarray
     acceleration: float
-    mostly: bool
+    most_bend: bool
 
 
 @dataclass(frozen=True)
@@ -234,17 +234,17 @@ class CoordinateTask:
         curved = self.on_lines.curved(of_each)
         free = ~held[some.flights]
         in_curved = some.counts[curved & free].sum()
-        mostly = bool(in_curved > MOSTLY * some.counts[free].sum())
-        if mostly:
+        most_bend = bool(in_curved > MOSTLY * some.counts[free].sum())
+        if most_bend:
             curved = self.that_can_bend
         straight = self.likely(np.zeros_like(curved))
         if curved.any():
             bent = self.likely(curved)
             price_of_all = curved.sum() * of_each
             if bent.evidence + price_of_all < straight.evidence:
-                return Explained(bent, curved, self.acceleration, mostly)
+                return Explained(bent, curved, self.acceleration, most_bend)
         none = np.zeros_like(curved)
-        return Explained(straight, none, self.acceleration, mostly)
+        return Explained(straight, none, self.acceleration, most_bend)
 
     @property
     def that_can_bend(self) -> np.ndarray:
@@ -259,39 +259,31 @@ def likely_errors(
     estimated: bool,
     speeds: np.ndarray,
 ) -> tuple[Errors, Flight, np.ndarray]:
-    """Most likely errors of places in these flights: white ones, if `estimated`, and
-    waves.
+    """Most likely errors of the places, the model, and which flights bend (F, n).
 
-    And the model, and the coordinates (F, n) in which flights have accelerations of
-    their own, where that costs less. Waves by restricted likelihood, as each flight has
-    a line or a parabola; lines or parabolas by the likelihood; the prices are BIC's.
-    Where most flights bend in one place, or angle, all bend in the others, too: drag
-    and spin bend all places, though one by little. `speeds` (n,): of the flights.
+    Errors are waves, and white ones, estimated if `estimated`, else of the known sigma.
+    A flight that bends in a coordinate has an acceleration of its own there: a parabola
+    in the place of a line. Each coordinate is judged alone, by BIC: errors by the
+    restricted likelihood, bending by the likelihood. Then `_bent_alike` compares
+    coordinates. One with no more values than two for each flight keeps its sigma, and
+    has no waves. `speeds` (n,): root mean squares over the flights, which limit waves.
     """
     n = len(frames.sigma)
     held = held_rather(frames, flights, flight)
     tasks: dict[int, CoordinateTask] = {}
     found: dict[int, Explained] = {}
     for c in range(n):
-        some = Coordinate.of(frames, flights, flight, c)
-        if len(some.t) <= 2 * len(some.starts):
+        coordinate = Coordinate.of(frames, flights, flight, c)
+        if len(coordinate.t) <= 2 * len(coordinate.starts):
             continue
         known = None
         if not estimated:
             known = float(frames.sigma[c])
         fastest = WAVE_SPEED * speeds[c]
-        tasks[c] = CoordinateTask.of(frames, some, flight, c, known, fastest)
+        tasks[c] = CoordinateTask.of(frames, coordinate, flight, c, known, fastest)
         found[c] = tasks[c].explained(held)
     angles = np.array(frames.angles or (False,) * n)
-    for kind in (angles, ~angles):
-        alike = [c for c in found if kind[c]]
-        if not any(found[c].mostly and found[c].bent.any() for c in alike):
-            continue
-        for c in alike:
-            if not found[c].bent.any():
-                curved = tasks[c].that_can_bend
-                errors = tasks[c].likely(curved)
-                found[c] = found[c]._replace(errors=errors, bent=curved)
+    found = _bent_alike(found, tasks, angles)
     sigma = frames.sigma.copy()
     waves: list[tuple[Wave, ...]] = [()] * n
     bent = np.zeros((len(flights), n), bool)
@@ -382,6 +374,28 @@ def _cheapest(frames: Frames, found: Sequence[Verdict]) -> Verdict:
         return _cost(frames, verdict) + cost_of_flight * len(verdict.flights)
 
     return min(found, key=cost)
+
+
+def _bent_alike(
+    found: dict[int, Explained], tasks: dict[int, CoordinateTask], angles: np.ndarray
+) -> dict[int, Explained]:
+    """What explains each coordinate, once places are compared with places, and
+    `angles` (n,) with angles.
+
+    Where most flights bend in one of a kind, all that can bend in the others of that
+    kind: drag and spin bend all of them, though one by little.
+    """
+    bent = dict(found)
+    for kind in (angles, ~angles):
+        alike = [c for c in found if kind[c]]
+        if not any(found[c].most_bend and found[c].bent.any() for c in alike):
+            continue
+        for c in alike:
+            if not found[c].bent.any():
+                curved = tasks[c].that_can_bend
+                errors = tasks[c].likely(curved)
+                bent[c] = found[c]._replace(errors=errors, bent=curved)
+    return bent
 
 
 @dataclass(frozen=True)

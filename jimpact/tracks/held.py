@@ -28,46 +28,54 @@ def free_flights(
     left.
 
     A run of flights at an end is held where one parabola explains it as well (chi^2 and
-    prices of flights), or where the sum of `held_rather` over it exceeds HELD.
+    prices of flights), or where the sum of `held_rather` over it exceeds HELD. The late
+    end goes first. Where all are held the first one stays; a single flight, or flights
+    without acceleration, are not judged.
     """
     if not acceleration.any() or len(flights) < 2:
         return flights
     held = held_rather(frames, acceleration, flights)
     alone = np.array([chi_squared(frames, acceleration, some) for some in flights])
-    start = price(*frames.q.shape)  # chi^2 that one more flight must save
+    price_of_flight = price(*frames.q.shape)  # chi^2 that one more flight must save
 
-    def more(run: np.ndarray) -> float:
+    def cost_of_joining(run: np.ndarray) -> float:
         """Increase of chi^2 if one parabola replaces the arcs of a run of flights."""
         whole = np.sort(np.concatenate([flights[k] for k in run]))
         return _of_one_parabola(frames, acceleration, whole) - float(alone[run].sum())
 
-    def count(order: np.ndarray) -> int:
-        """Number of the first flights in this order that are held, by likelihood or
-        parabola.
-        """
-        sums = np.cumsum(held[order])
-        if sums.size and sums.max() > HELD:
-            curved = int(np.argmax(sums)) + 1
-        else:
-            curved = 0
-        few = 1
-        many = len(order)  # by bisection how many one parabola explains
-        while few < many:
-            middle = (few + many + 1) // 2
-            if more(order[:middle]) < start * (middle - 1):
-                few = middle
-            else:
-                many = middle - 1
-        while few > 1 and more(order[:few]) - more(order[: few - 1]) > start:
-            few -= 1  # the last one costs more than it would alone
-        if few > 1:
-            straight = few
-        else:
-            straight = 0
-        return max(curved, straight)
+    def joined_by_one_parabola(from_end: np.ndarray) -> int:
+        """Number of flights from an end on that one parabola explains as well as their
+        arcs do, by bisection; 0 for one.
 
-    last = len(flights) - count(np.arange(len(flights))[::-1])
-    first = count(np.arange(last))
+        Without the last ones, if each costs more than a flight of its own.
+        """
+        low = 1
+        high = len(from_end)
+        while low < high:
+            middle = (low + high + 1) // 2
+            if cost_of_joining(from_end[:middle]) < price_of_flight * (middle - 1):
+                low = middle
+            else:
+                high = middle - 1
+        count = low
+        while count > 1:
+            of_last = cost_of_joining(from_end[:count])
+            of_last -= cost_of_joining(from_end[: count - 1])
+            if of_last <= price_of_flight:
+                return count
+            count -= 1
+        return 0
+
+    def held_from(from_end: np.ndarray) -> int:
+        """Number of held flights from an end on, by likelihood or one parabola."""
+        sums = np.cumsum(held[from_end])
+        by_likelihood = 0
+        if sums.size and sums.max() > HELD:
+            by_likelihood = int(np.argmax(sums)) + 1
+        return max(by_likelihood, joined_by_one_parabola(from_end))
+
+    last = len(flights) - held_from(np.arange(len(flights))[::-1])
+    first = held_from(np.arange(last))
     if last > first:
         return flights[first:last]
     return flights[:1]

@@ -39,6 +39,8 @@ LOOKED_AT = 400
 # another.
 MOST_BODIES = 6
 ALTERNATING = 10.0
+# Rows of each body that are needed: four have a third difference, one more a median.
+ROWS_OF_A_BODY = 5
 
 # Share of the flights on both sides that flights within one contact last at most. Three
 # times more: any impacts are one.
@@ -198,7 +200,7 @@ def findings_of_bodies(q: np.ndarray) -> list[str]:
     table.
 
     Third differences of every second, third, .. row are then far smaller than those of
-    all.
+    all, in one coordinate at least.
     """
 
     def jumps(distance: int) -> np.ndarray:
@@ -208,7 +210,7 @@ def findings_of_bodies(q: np.ndarray) -> list[str]:
 
     whole = jumps(1)
     for bodies in range(2, MOST_BODIES + 1):
-        if len(q) < 4 * bodies + bodies:
+        if len(q) < ROWS_OF_A_BODY * bodies:
             break
         own = jumps(bodies)
         if (own * ALTERNATING < whole).any():

@@ -411,8 +411,11 @@ def _times(
 
 
 def _optitrack(path: Path, lines: Lines) -> Capture:
-    """CSV of OptiTrack Motive: a row of keys and values, rows of names; lost is
-    empty.
+    """CSV of OptiTrack Motive: a row of keys and values, rows with the name, kind and
+    axis of each column, then frames.
+
+    The first columns are frame and time; an empty cell is a place that was lost. Of
+    rotations quaternions are read, angles are left out.
     """
     rows = _cells(lines, ",")
     _, first = next(rows)
@@ -420,31 +423,20 @@ def _optitrack(path: Path, lines: Lines) -> Capture:
     keys = first[::2]
     head = dict(zip(keys, first[1::2]))
     names, kinds, axes = _heads_of_optitrack(path, rows)
-    places: dict[str, dict[str, int]] = {}
-    for k in range(2, len(axes)):
-        if k < len(kinds):
-            kind = kinds[k]
-        else:
-            kind = ""
-        if kind in ("Position", "Rotation") and k < len(names) and names[k]:
-            axis = axes[k].lower()
-            if kind == "Rotation":
-                axis = f"q{axis}"
-            of_name = places.setdefault(names[k], {})
-            of_name[axis] = k
-    turns = head.get("Rotation Type", "Quaternion")
-    if turns != "Quaternion":  # angles about axes are no quaternions
-        places = {
-            x: {a: k for a, k in of.items() if a in PLACE} for x, of in places.items()
-        }
+    quaternions = head.get("Rotation Type", "Quaternion") == "Quaternion"
+    columns = _columns_of_optitrack(names, kinds, axes, quaternions)
     body = _rows(path, rows, len(axes))
     values = body.values
     exported = "Total Exported Frames"
     _check_count(path, exported, head.get(exported, ""), values)
     order = {
-        x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()
+        name: tuple(axis for axis in (*PLACE, *TURN) if axis in of_axes)
+        for name, of_axes in columns.items()
     }
-    found = {x: values[:, [places[x][a] for a in order[x]]] for x in places}
+    found = {
+        name: values[:, [columns[name][axis] for axis in order[name]]]
+        for name in columns
+    }
     export_rate = head.get("Export Frame Rate")
     rate_in_words = export_rate or head.get("Capture Frame Rate", "")
     rate = _stated(path, "rate", rate_in_words)
@@ -452,6 +444,26 @@ def _optitrack(path: Path, lines: Lines) -> Capture:
     frames, times, *_ = values.T
     t = _times(path, frames, times, rate, body.digit)
     return Capture("OptiTrack CSV", order, found, unit, rate, t)
+
+
+def _columns_of_optitrack(
+    names: Sequence[str],
+    kinds: Sequence[str],
+    axes: Sequence[str],
+    quaternions: bool,
+) -> dict[str, dict[str, int]]:
+    """Column of each axis by name: x, y, z, and with `quaternions` qx .. qw."""
+    columns: dict[str, dict[str, int]] = {}
+    known = min(len(names), len(kinds), len(axes))
+    for k in range(HEAD, known):
+        axis = axes[k].lower()
+        if kinds[k] == "Rotation" and quaternions:
+            axis = f"q{axis}"
+        elif kinds[k] != "Position":
+            continue
+        if names[k]:
+            columns.setdefault(names[k], {})[axis] = k
+    return columns
 
 
 def _heads_of_optitrack(
