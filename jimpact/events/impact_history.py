@@ -130,13 +130,13 @@ class HistoryProgram:
 
 class Sample(NamedTuple):
     """Where a sample lies: its time over the duration; state, modes and clock of the
-    step that contains it, at the beginning of that step.
+    step that contains it, at the beginning of that step. Or s of them.
     """
 
-    fraction: Float[Array, ""]
-    begin: Float[Array, "n B"]
-    modes: Int[Array, "modes B"]
-    clock: Float[Array, "clock B"]
+    fraction: Float[Array, "*s"]
+    begin: Float[Array, "*s n B"]
+    modes: Int[Array, "*s modes B"]
+    clock: Float[Array, "*s clock B"]
 
 
 def _sampled(
