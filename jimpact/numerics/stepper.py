@@ -45,7 +45,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Num, Shaped
 from jimpact.numerics.driver import SLOTS
 from jimpact.numerics.tableaux import DOP853
 from jimpact.numerics.tangents import Dual, dual_like, is_dual, pushforward, value_of
-from jimpact.tools.loops import cond, scan
+from jimpact.tools.loops import cond, in_a_branch, scan
 from jimpact.tools.precision import precision
 
 # Step-size control: a step is at most GROWTH times and at least SHRINK times the one
@@ -285,11 +285,18 @@ class _StepVariable(NamedTuple):
     length: Any  # of the step in xi
     rooted: Any  # 1 where xi is a root, 0 elsewhere
     zero_length: Any  # mask of landings on a margin that is 0
+    in_time: Any  # 1 where the step is no landing, 0 elsewhere
 
 
-def _frame(
-    flow: Flow, s: Step, y: Float[Array, "n B"]
-) -> tuple[Any, Float[Array, "k B"], _StepVariable]:
+class _Frame(NamedTuple):
+    """What a step is computed with."""
+
+    const: Any  # constants of the flow
+    margins: Float[Array, "k B"]  # at the beginning
+    variable: _StepVariable
+
+
+def _frame(flow: Flow, s: Step, y: Float[Array, "n B"]) -> _Frame:
     """Constants of the flow, margins at the beginning, and the variable xi of the step.
 
     In time xi runs from the `start` of the clock for its length h; on a landing from c,
@@ -312,8 +319,8 @@ def _frame(
     length = jnp.where(lands, -xi0, s.length)
     no_length = jax.lax.stop_gradient(xi0) - xi0
     length = jnp.where(zero_length, no_length, length)
-    variable = _StepVariable(start, length, rooted, zero_length)
-    return const, jax.lax.stop_gradient(c0), variable
+    variable = _StepVariable(start, length, rooted, zero_length, 1 - s.lands)
+    return _Frame(const, jax.lax.stop_gradient(c0), variable)
 
 
 class _StepResult(NamedTuple):
@@ -330,7 +337,7 @@ class _StepResult(NamedTuple):
 def _slopes(
     flow: Flow,
     const: Any,
-    frame: _StepVariable,
+    variable: _StepVariable,
     s: Step,
     y: Float[Array, "n B"],
     stage: Any,
@@ -343,8 +350,8 @@ def _slopes(
     node c_i, and the sum `sum_j a_ij k_j` of slopes that leads to its state.
     """
     i, node, change = stage
-    xi = frame.start + node * frame.length
-    now = y[: len(change)] + frame.length * change
+    xi = variable.start + node * variable.length
+    now = y[: len(change)] + variable.length * change
     dy = flow.field(const, s.modes, now)
 
     def rates_of_margins() -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
@@ -361,17 +368,17 @@ def _slopes(
         value, dc = rates_of_margins()
     # dt/dxi = N / R: N = 2 xi of a root, else 1; R = dc_k/dt of a landing, else 1
     of_target = jnp.where(s.target, dc, 0.0)
-    rate = total(of_target) + (1 - s.lands)
-    never = frame.zero_length & (rate == 0)
+    rate = total(of_target) + variable.in_time
+    never = variable.zero_length & (rate == 0)
     rate = jnp.where(never, jnp.inf, rate)
-    dt = (1 + frame.rooted * (2 * xi - 1)) / rate
+    dt = (1 + variable.rooted * (2 * xi - 1)) / rate
     rows = [dy[first:last] * dt for first, last in pairwise(ends)]
     return [*rows, dt], jax.lax.stop_gradient((value, dc))
 
 
-def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
-    """One step of the Runge-Kutta method; rates and margins at the end only where it
-    `ends`.
+def _stages(flow: Any, s: Step, y: Any, frame: Any, ends: bool) -> _StepResult:
+    """One step of the Runge-Kutta method in its `_Frame`; rates and margins at the end
+    only where it `ends`.
 
     Where `flow` or y has tangents (see `tangents.py`) the change has some, too.
     """
@@ -379,7 +386,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
     n = state.shape[0]
     dtype = state.dtype
     batch = state.shape[1:]
-    const, c0, frame = pushforward(lambda flow, y: _frame(flow, s, y), flow, y)
+    const, c0, variable = frame
     # the 13th evaluation, that of the end, has no weight
     if ends:
         count = STAGES + 1
@@ -392,10 +399,10 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
     def evaluate(i: Integer[Array, ""], node: Float[Array, ""], change: Any) -> Any:
         """Slopes of a stage as new rows of both tables; margins and their rates."""
         new, margins = pushforward(
-            lambda flow, const, frame, y, change: _slopes(
-                flow, const, frame, s, y, (i, node, change), ends_of
+            lambda flow, const, variable, y, change: _slopes(
+                flow, const, variable, s, y, (i, node, change), ends_of
             ),
-            *(flow, const, frame, y, change),
+            *(flow, const, variable, y, change),
         )
         slopes = new[: len(blocks)]
         return (slopes, new[len(blocks) :]), margins
@@ -408,26 +415,25 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
         stages = _scanned
     else:
         stages = _written_out
-    no_margins = jnp.zeros_like(s.target, dtype)
-    tables, (d0, c1, d1) = stages(evaluate, row, count, no_margins)
+    tables, (d0, c1, d1) = stages(evaluate, row, count, c0)
     padded = np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES)))
     weights = jnp.asarray(padded, dtype)
-    change, errors = _weighted(tables, weights, frame.length)
+    change, errors = _weighted(tables, weights, variable.length)
     of_state = errors[:, :n]
     return _StepResult(change, of_state, (c0, c1), (d0, d1))
 
 
 def _scanned(
-    evaluate: Any, row: list[Any], count: int, none: Float[Array, "k B"]
+    evaluate: Any, row: list[Any], count: int, c0: Float[Array, "k B"]
 ) -> tuple[Any, Any]:
     """Slopes of all stages in two tables (count, rows, B), and margins at both ends, by
     a scan.
 
     `row` has an empty row (1, rows, B) of each table. Of the margins: rates in the
-    first stage, values and rates in the last, from `none`. One kernel for all stages:
-    it compiles quickly.
+    first stage, values and rates in the last; the margins c0 at the beginning stand for
+    those that are not known yet. One kernel for all stages: it compiles quickly.
     """
-    dtype = none.dtype
+    dtype = c0.dtype
     padded = np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES)))
     table = jnp.asarray(padded, dtype)
 
@@ -451,13 +457,13 @@ def _scanned(
         table,
         jnp.asarray(_NODES[:count], dtype),
     )
-    nothing_yet = (*tables, none, none, none)
-    (slopes, added, *margins), _ = scan(stage, nothing_yet, each)
+    start = (*tables, c0, c0, c0)
+    (slopes, added, *margins), _ = scan(stage, start, each)
     return [slopes, added], margins
 
 
 def _written_out(
-    evaluate: Any, row: list[Any], count: int, none: Float[Array, "k B"]
+    evaluate: Any, row: list[Any], count: int, c0: Float[Array, "k B"]
 ) -> tuple[Any, Any]:
     """Slopes and margins as `_scanned`, each stage with kernels of its own.
 
@@ -477,7 +483,7 @@ def _written_out(
                 ),
                 *(tables[0][j] for j in used),
             )
-        node = jnp.asarray(_NODES[i], none.dtype)
+        node = jnp.asarray(_NODES[i], c0.dtype)
         index = jnp.asarray(i, jnp.uint32)
         new, margin = evaluate(index, node, change)
         for table, empty, part in zip(tables, row, new):
@@ -639,6 +645,31 @@ def goes_on(carry: StepperState, most: int) -> Bool[Array, "1 B"]:
     return (carry.mark == Mark.GOES_ON) & (carry.passes < most)
 
 
+def _prepared(
+    flow: Any, state: StepperState, most: int
+) -> tuple[_Frame, Bool[Array, "1 B"], Float[Array, "1 B"]]:
+    """The frame of the step to try, which impacts go on, and their local tolerance.
+
+    All of them in a branch, see `in_a_branch`.
+    """
+    s = state.step
+    always = state.passes[0, 0] >= 0
+    plain = value_of(flow)
+
+    def all_three(flow: Flow, y: Float[Array, "n B"]) -> Any:
+        """The three results, in a branch."""
+        return in_a_branch(
+            always,
+            lambda: (
+                _frame(flow, s, y),
+                goes_on(state, most),
+                _local_tolerance(plain, state.passes, y.dtype),
+            ),
+        )
+
+    return pushforward(all_three, flow, state.y)
+
+
 def advance(
     flow: Flow, state: StepperState, most: int
 ) -> tuple[StepperState, Bool[Array, "1 B"]]:
@@ -652,14 +683,14 @@ def advance(
     flow, y = value_of((flow, start))  # without tangents
     n = y.shape[0]
     lands = s.lands > 0
-    change, errors, (c0, c1), (d0, d1) = _stages(duals, s, start, ends=True)
-    error2 = _squared_error(flow, s, y, errors, state.passes)
+    frame, active, local = _prepared(duals, state, most)
+    change, errors, (c0, c1), (d0, d1) = _stages(duals, s, start, frame, ends=True)
+    error2 = _squared_error(flow, s, y, errors, local)
     ok = error2 <= 1
     elapsed = value_of(change)[n:]  # the last row is time
     duration = jnp.where(ok & (elapsed > 0), elapsed, state.expected)
     course = _Course(c0, c1, d0 * duration, d1 * duration)
     urgent = _most_urgent(*_intentions(flow, s, state.aimed_twice, course))
-    active = goes_on(state, most)
     accept = ok & (urgent.intention == Intention.AHEAD) & active
     events = s.target & (accept & lands)  # one-hot
     # the field has no value, however short the step: given up, and the status reports
@@ -695,22 +726,30 @@ def advance(
     return StepperState(end, *planned), accept
 
 
+def _local_tolerance(
+    flow: Flow, passes: Float[Array, "1 B"], dtype: Any
+) -> Float[Array, "1 B"]:
+    """The tolerance of one step: it falls with the number of passes beyond FULL for
+    each contact.
+    """
+    full = FULL * flow.taking_part
+    share = full / jnp.maximum(passes, full)
+    return jnp.maximum(flow.tolerance * share, precision(dtype).noise)
+
+
 def _squared_error(
     flow: Flow,
     s: Step,
     y: Float[Array, "n B"],
     errors: Float[Array, "2 n B"],
-    passes: Float[Array, "1 B"],
+    local: Float[Array, "1 B"],
 ) -> Float[Array, "1 B"]:
     """Hairer's error of a step, squared, in tolerances.
 
     Equation: `e5^4 / (e5^2 + 0.01 e3^2)` of the largest scaled errors e5 and e3 of both
-    estimates.
+    estimates, with the `local` tolerance.
     """
     zero = precision(y.dtype)
-    full = FULL * flow.taking_part
-    share = full / jnp.maximum(passes, full)
-    local = jnp.maximum(flow.tolerance * share, zero.noise)
     allowed = local * flow.allowance(s.modes, y)
     scale = allowed + zero.accumulated * jnp.abs(y)
     largest = jnp.max(jnp.abs(errors) / scale[None], axis=1)
@@ -1002,4 +1041,5 @@ def between(
 
 def step_again(flow: Flow, s: Step, y: Float[Array, "n B"]) -> Float[Array, "n B"]:
     """The state after an accepted step, as a smooth function of `flow` and `y`."""
-    return y + _stages(flow, s, y, ends=False).change[:-1]
+    frame = pushforward(lambda flow, y: _frame(flow, s, y), flow, y)
+    return y + _stages(flow, s, y, frame, ends=False).change[:-1]
