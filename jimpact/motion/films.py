@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -122,7 +123,13 @@ def animation(
         else:  # both writers take fractions
             kind: Any = PillowWriter if path.suffix == ".gif" else FFMpegWriter
             writer = kind(fps=1 / (1 / frames_per_second + _CUT_OFF))
-            frames.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
+            # a film that is stopped leaves no file, and keeps an earlier one
+            with TemporaryDirectory(dir=path.parent) as folder:
+                whole = Path(folder) / path.name
+                frames.save(
+                    whole, writer=writer, progress_callback=lambda i, n: advance(1)
+                )
+                whole.replace(path)
     return path
 
 

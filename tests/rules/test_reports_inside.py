@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from canned import canned, rocked
-from matplotlib.animation import FFMpegWriter
+from matplotlib.animation import FFMpegWriter, PillowWriter
 from PIL import Image
 from programs import CODE
 from refusals import argument
@@ -403,6 +403,24 @@ def test_films_run_in_time(tmp_path):
         ji.plot.animation(system, found, "a.avi")
     with pytest.raises(ValueError, match="`speed`"):
         ji.plot.animation(system, found, tmp_path / "a.gif", speed=0.0)
+
+
+def test_a_film_that_is_stopped_keeps_the_earlier_one(tmp_path, monkeypatch):
+    path = tmp_path / "dimer.gif"
+    path.write_bytes(b"earlier")
+
+    grab = PillowWriter.grab_frame
+
+    def stopped_at_the_second(writer, **options):
+        if writer._frames:
+            raise KeyboardInterrupt
+        grab(writer, **options)
+
+    monkeypatch.setattr(PillowWriter, "grab_frame", stopped_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        ji.plot.animation(*rocked(), path)
+    assert path.read_bytes() == b"earlier"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_films_in_mp4_need_ffmpeg(tmp_path, monkeypatch):
