@@ -294,13 +294,13 @@ def changed_places(
 def _full_turns(
     corners: jax.Array, side: jax.Array, angle: jax.Array, direction: jax.Array
 ) -> jax.Array:
-    """Full turns (g,) between the `direction` (g,) [rad] to the other body and a facing
-    side.
+    """Full turns (g,) to add to the angle phi of a facing side's normal, so that it is
+    within half a turn of the `direction` (g,) [rad] to the other body.
 
-    Equation: `round((direction - phi) / 2 pi)`, phi the angle of the normal of `side`
-    (g,), counted on from the body's `angle` (g,) [rad], which has no jumps: from there
-    to the normal of side 0, and on to that of `side`, each by less than a turn.
-    `corners` (g, K, 2) [m].
+    Equation: `round((direction - phi) / 2 pi)`. phi has no jumps while the body turns:
+    it begins at the body's `angle` (g,) [rad], which has none, goes on to the normal of
+    side 0, and from there to that of `side` (g,), each time by less than a turn. Of g
+    pairs; `corners` (g, K, 2) [m] of polygons of K corners.
     """
     _, normals = sides(corners)
     angles = angle_in_plane(normals)  # (g, K)

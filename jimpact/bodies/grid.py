@@ -211,7 +211,9 @@ def _pair_contacts(
     """Contacts of bodies i and j (g,), k = `slots` a pair: gaps (g, k), points (g, k,
     d), normals.
 
-    `places` (b, ..) are the coordinates of all bodies; normals are towards body i.
+    With one slot bodies are discs or spheres about their middles; with two polygons,
+    whose corners may be round. `places` (b, ..) are the coordinates of all bodies;
+    normals are towards body i.
     """
     placed = (bodies.placed_at(places[x], bodies.points[x]) for x in (i, j))
     a, b = (body.points for body in placed)
@@ -390,10 +392,10 @@ def active_pairs(
 
     def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
         """The numbers, bodies and directions with the rows of the block from row
-        `first` on.
+        `first` on: those of closed contacts; beyond the last one `no_contact` and 0.
         """
-        used, chosen = chosen_rows(closed_up_to, first, count)
-        chosen = jnp.where(used, numbers[chosen], 0)
+        used, candidate = chosen_rows(closed_up_to, first, count)
+        chosen = jnp.where(used, numbers[candidate], 0)
         i, j, directions = _bodies_and_directions(bodies, q, chosen)
         between = jnp.stack([i, j], axis=1)
         number = jnp.where(used, chosen, no_contact)

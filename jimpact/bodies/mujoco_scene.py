@@ -148,15 +148,18 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
 
     Returns:
         `MujocoScene`: scene, velocity (n,) [m/s, rad/s], friction (m,), names of m
-            contacts.
+            contacts. The velocity is `data.qvel`, projected on the constraints, in the
+            metric of M, where it breaks them.
 
     Raises:
         ImportError: mujoco is missing; the extra is named.
         TypeError: not a model and its data.
         ValueError: data of another model, a negative margin, no contact, a deformable
-            body. Warnings name bodies that overlap, exceeded limits, unequal, torsional
-            or rolling friction that is left out, and a velocity that breaks
-            constraints.
+            body.
+
+    Warns:
+        UserWarning: bodies that overlap, exceeded limits, unequal, torsional or rolling
+            friction that is left out, a velocity that breaks constraints.
 
     Limits: contacts of flexible bodies, adhesion.
 
@@ -186,8 +189,8 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     mass = _mass(mujoco, model, data)
     root = np.linalg.cholesky(mass)
     contacts, jacobians = _contacts(mujoco, model, data)
-    limits, ends, distances = _limits(mujoco, model, data)
-    if not contacts and not limits:
+    limit_names, limit_normals, distances = _limits(mujoco, model, data)
+    if not contacts and not limit_names:
         raise ValueError(
             "Argument `data` must have a contact that can move, but has none: no geoms "
             "touch at data.qpos. Argument `margin` finds contacts before they close."
@@ -200,8 +203,8 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
         for c in contacts
     )
     _warn_of_overlap(model, contacts, names)
-    _warn_of_exceeded_limits(mujoco, model, data, limits)
-    normals_alone = np.pad(ends[:, None], ((0, 0), (0, 2), (0, 0)))
+    _warn_of_exceeded_limits(mujoco, model, data, limit_names)
+    normals_alone = np.pad(limit_normals[:, None], ((0, 0), (0, 2), (0, 0)))
     jacobians = np.concatenate([jacobians, normals_alone])
     _, gradients = _rows_of(mujoco, model, data, _EQUALITIES)
     constraints = _independent(root, gradients.T)
@@ -209,7 +212,7 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     gaps = np.where(gaps > touching, gaps, 0.0)
     tangents = _tangents(root, jacobians[:, 1:])
     of_contacts = _friction(contacts, names)
-    sliding = np.pad(of_contacts, (0, len(limits)))
+    sliding = np.pad(of_contacts, (0, len(limit_names)))
     if tangents is None:
         friction = None
     else:
@@ -226,7 +229,7 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
         )
     measured = np.array(data.qvel)
     velocity = jnp.asarray(_admissible(root, constraints, measured))
-    return MujocoScene(scene, velocity, friction, names + limits)
+    return MujocoScene(scene, velocity, friction, names + limit_names)
 
 
 def _grow_bounding_volumes(model: Any, by: float) -> None:

@@ -14,7 +14,7 @@ from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.study import run_of, system_of
 from jimpact.motion.system import System
-from jimpact.shots.shots_file import UNEVEN_STEPS, Positions, read_positions
+from jimpact.shots.shots_file import UNEVENNESS, Positions, read_positions
 from jimpact.tools.study_tables import check_keys, check_kind
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class MotionStudy:
             )
         start, _ = self.arguments["t_end"]
         times, q, sigma = self.measured
-        if abs(times[0] - start) > UNEVEN_STEPS * (times[1] - times[0]):
+        if abs(times[0] - start) > UNEVENNESS * (times[1] - times[0]):
             raise ValueError(
                 f"`t` in [data] must begin at {start:g} s, but begins at {times[0]:g} "
                 f"s."

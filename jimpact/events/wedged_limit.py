@@ -66,7 +66,9 @@ def inspect(
 
 
 def cycle_at(flow: Any, carry: StepperState) -> Cycle:
-    """The state of the impact now, as that of a cycle."""
+    """The state of the impact now, as that of a cycle that begins: no contact counts as
+    wedged, or as one that stops, yet.
+    """
     modes = carry.step.modes
     x, g, p = flow.rows(carry.y)
     no = jnp.zeros(x.shape, bool)
@@ -74,7 +76,8 @@ def cycle_at(flow: Any, carry: StepperState) -> Cycle:
         modes=modes,
         passes=carry.passes,
         gamma=flow.scales(modes) * g,
-        root=jnp.sqrt(flow.energy(x, jnp.zeros_like(x))),
+        # of the energy stored by x alone
+        root=jnp.sqrt(flow.energy(x, g=jnp.zeros_like(x))),
         slip=flow.slip(carry.y),
         impulse=p,
         side=flow.side_impulse(carry.y),

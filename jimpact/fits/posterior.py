@@ -103,7 +103,7 @@ def posterior(
         inner = _Inner(problem, problem.matrix)
     first = dict(zip(problem.names, _inside(start, problem.domains)))
     if inner is not None:
-        first = {_FREE: inner.free(start)}
+        first = {_FREE: inner.unbounded(start)}
     kernel = numpyro.infer.NUTS(
         _model(problem, each, inner, numpyro),
         forward_mode_differentiation=True,
@@ -240,11 +240,14 @@ class _Inner:
         of_directions = (self.count - 1) * jnp.log(move / r)
         return x, slope + of_directions
 
-    def free(self, start: np.ndarray) -> jax.Array:
-        """z (P,) of values x: `|z| = L artanh(|y - y_0| / L)`, at most `1 - _INSIDE` of
-        the way.
+    def unbounded(self, values: np.ndarray) -> jax.Array:
+        """z (P,) of admissible `values` (P,): the inverse of `values`.
+
+        Equation: `z = L artanh(|y - y_0| / L) d`, along d from the center y_0 of the
+        region to the point y of these values, L as far as the region reaches there. A
+        point beyond `1 - _INSIDE` of L counts as one there; the center has z = 0.
         """
-        point = jnp.asarray(self.problem.variables.point(start))
+        point = jnp.asarray(self.problem.variables.point(values))
         move = (point - self.region.center)[: self.count]
         size = jnp.linalg.norm(move)
         if size == 0:

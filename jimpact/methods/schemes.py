@@ -531,16 +531,29 @@ def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
         """Impulses at v- (n,) with rtol `setting`, to the end of the step in which it
         is over.
 
-        That changes no impulse, but the duration is not known. The event
-        `max(x, -gamma) = rtol` must be crossed downwards: the impact begins at the
-        approach itself.
+        The rest of that step, after the end, changes no impulse, but the duration is
+        not known. The event `max(x, -gamma) = rtol` must be crossed downwards: the
+        impact begins at the approach itself.
         """
         problem = scaled(law, scene, velocity)
         field = field_of(problem)
         rtol = jnp.asarray(setting, field.gamma.dtype)
-        x, p, none = field.start  # no friction: each part more of a state costs time
+        # without friction: each part more of a state costs time
+        x, p, no_friction = field.start
+
+        def rates(t: Any, y: Any, args: Any) -> tuple[Any, Any]:
+            """(x', p') at y = (x, p)."""
+            field, _ = args
+            x_rate, p_rate, _ = field.rates(*y, no_friction, slow=0.0)
+            return x_rate, p_rate
+
+        def margin(t: Any, y: Any, args: Any, **_: Any) -> Any:
+            """`max(x, -gamma) - rtol`, the largest of all contacts."""
+            field, rtol = args
+            return field.at_work(*y, no_friction) - rtol
+
         result = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: args[0].rates(*y, none, 0.0)[:2]),
+            diffrax.ODETerm(rates),
             solver,
             t0=jnp.zeros_like(rtol),
             t1=jnp.full_like(rtol, jnp.inf),
@@ -548,10 +561,7 @@ def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
             y0=(x, p),
             args=(field, rtol),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-            event=diffrax.Event(
-                lambda t, y, args, **_: args[0].at_work(*y, none) - args[1],
-                direction=False,
-            ),
+            event=diffrax.Event(margin, direction=False),
             adjoint=diffrax.ForwardMode(),
             max_steps=problem.dynamics.max_steps,
             throw=False,
@@ -561,11 +571,11 @@ def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
         if stages is None:
             evaluations = jnp.full_like(steps, UNCOUNTED)
         else:
-            evaluations = stages * steps + 1
+            evaluations = stages * steps + 1  # one chooses the first step
         ended = result.result == diffrax.RESULTS.event_occurred
         code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
         impulse = result.ys[1][-1]
-        return problem.solution(impulse, jnp.nan, evaluations, code, none)
+        return problem.solution(impulse, jnp.nan, evaluations, code, no_friction)
 
     return solve
 

@@ -230,10 +230,10 @@ class CompliantFlow(MotionFlow):
         return self.with_margin_of_sample(margins, state)
 
     def _normal_margins(
-        self, const: Int[Array, " m"], rate: Float[Array, " m"], x: Float[Array, " m"]
+        self, phases: Int[Array, " m"], rate: Float[Array, " m"], x: Float[Array, " m"]
     ) -> Float[Array, " 2*m"]:
-        """Margins of phases `const`: m by the indentation x [m], then m by the gap
-        velocity [m/s].
+        """Margins that are >= 0 while contacts keep their phases: m by the indentation
+        x [m], then m by the gap velocity f' [m/s], `rate`.
 
         | phase | by x | by gap velocity |
         |---|---|---|
@@ -241,14 +241,20 @@ class CompliantFlow(MotionFlow):
         | compression | 1 | -f': it turns to expansion |
         | expansion | x: it opens | f': it is compressed again |
 
-        With a force that may vanish at x > 0 (`slackens`) the first margin is
-        `Force.onset` in compression, minus that where slack, and the second one x: the
-        contact opens at x = 0. All are in units of the scales.
+        With a force that may vanish at x > 0 (`slackens`), which has compression and,
+        in the place of expansion, slack:
+
+        | phase | by x | by gap velocity |
+        |---|---|---|
+        | compression | `Force.onset`: it slackens | x: it opens |
+        | slack | -`Force.onset`: it presses again | x: it opens |
+
+        All are in units of the scales.
         """
         scales = self.scales
         gamma = rate / scales.speed
         depth = x / scales.depth
-        compressed = const == Phase.COMPRESSION
+        compressed = phases == Phase.COMPRESSION
         if self.force.slackens:
             inside = jnp.where(x >= 0, x, 0.0)
             left = self.force.onset(inside, -rate)
@@ -256,10 +262,10 @@ class CompliantFlow(MotionFlow):
             by_x = jnp.where(compressed, onset, -onset)
             by_g = depth
         else:
-            expands = const == Phase.EXPANSION
+            expands = phases == Phase.EXPANSION
             by_x = jnp.where(expands, depth, 1.0)
             by_g = jnp.where(compressed, -gamma, gamma)
-        is_open = const == Phase.OPEN
+        is_open = phases == Phase.OPEN
         by_x = jnp.where(is_open, -depth, by_x)
         by_rate = jnp.where(is_open, 1.0, by_g)
         return jnp.concatenate([by_x, by_rate])

@@ -156,7 +156,7 @@ def _frames(
     system: System, motion: Motion, title: str, speed: float | None, rate: float
 ) -> tuple[int, FuncAnimation]:
     """Number of frames, and the film of a motion at `speed`, with `rate` frames a
-    second.
+    second; speed None: `readable_speed`.
     """
     course = course_of(motion)
     body = system.body
@@ -174,35 +174,50 @@ def _frames(
     else:
         speed = float(speed)
     duration = (at[-1] - at[0]) / speed
-    count = int(duration * rate + 1e-9) + 1
+    count = int(duration * rate + 1e-9) + 1  # rounding loses no last frame
     time = at[0] + np.arange(count) * speed / rate
     rates = jax.vmap(body.rates)
     slopes = np.asarray(rates(jnp.asarray(q), jnp.asarray(v)))  # dq/dt
     q = positions(at, q, slopes, time)
-    ground = np.zeros((count, 2))
+    ground = _base_in_picture(system, time)
     point = POINT * (np.ptp(q) or 1.0)
     if system.base is not None:
         seen = jax.vmap(partial(seen_from_base, system))
         q = np.asarray(seen(jnp.asarray(q), jnp.asarray(time)))
-        ground = base_path(system, time)  # in the picture
-        if ground.shape[1] == 3:
-            ground = projected(ground)
-        elif ground.shape[1] == 1:
-            ground = np.insert(ground, 0, 0.0, axis=1)
     curves = [
         [curve + moved for curve in (*body.shadows(x), *body.outlines(x, point))]
         for x, moved in zip(q, ground)
     ]
-    digits_that_differ = int(np.ceil(-np.log10(speed / rate)))
-    digits = max(2, digits_that_differ)  # in which frames differ
-    if speed == 1:
-        slow = ""
-    else:
-        slow = f" (speed {speed:g})"
-    captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
+    captions = _captions(title, time, speed, rate)
     shadows = [GREY] * len(body.shadows(q[0]))
     colours = [*shadows, *colours_of(body, q[0], point)]
     return count, _film(body, curves, colours, ground, captions)
+
+
+def _base_in_picture(system: System, time: np.ndarray) -> np.ndarray:
+    """Path (F, 2) [m] of the base in the picture: of a base in space projected, of one
+    on a line upwards; 0 without a base.
+    """
+    if system.base is None:
+        return np.zeros((len(time), 2))
+    path = base_path(system, time)
+    if path.shape[1] == 3:
+        return projected(path)
+    if path.shape[1] == 1:
+        return np.insert(path, 0, 0.0, axis=1)
+    return path
+
+
+def _captions(title: str, time: np.ndarray, speed: float, rate: float) -> list[str]:
+    """Title and time of each frame, with the digits in which frames differ; the speed
+    where it is not 1.
+    """
+    digits_that_differ = int(np.ceil(-np.log10(speed / rate)))
+    digits = max(2, digits_that_differ)
+    slow = ""
+    if speed != 1:
+        slow = f" (speed {speed:g})"
+    return [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
 
 
 def _film(

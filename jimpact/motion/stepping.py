@@ -716,10 +716,12 @@ def _offsets(
     added: Float[Array, " m"],
 ) -> tuple[Float[Array, "m b"], Float[Array, "m b"]]:
     """Offsets w of `0 <= p _|_ gamma' + w >= 0`, for friction at the end and at the
-    mean slip.
+    mean slip; gamma' is the gap velocity at the end of the step.
 
-    Equation: `w_n = e (gamma + added) - added` where gamma < 0, else gamma;
-    `w_t = e_t u` for friction against the slip at the end, `w_t = u` for the mean slip.
+    Equation: `w_n = e (gamma + added) - added` where gamma < 0, else gamma: a contact
+    strikes at `gamma + added`, leaves at -e times that, and the forces, which act on
+    after the impact, add `added` once more. `w_t = e_t u` for friction against the slip
+    at the end, `w_t = u` for the mean slip.
 
     Args:
         e: coefficient () or (m,) of normal restitution.

@@ -76,17 +76,23 @@ def solve_many(
 ) -> Many:
     """Impulses x of contacts with Coulomb friction, normals first (b = 1, 2, 3).
 
+    Equation: `0 <= x_n _|_ (A x + rate)_n >= 0`, `|x_t| <= mu (x_n + load)`, x_t
+    against the slip `(A x + rate)_t` where it slides.
+
     Args:
         product: x -> A x; rows of contacts that take no part are 0.
         diagonal: of A.
-        rate: (a, b) [m/s].
+        rate: gap velocities and slips without the impulses [m/s].
         friction: mu.
         start: x to begin with.
         inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal
             of 1.
         tolerance: misfit at which it ends, of the largest of `rate`.
         most: iterations, an int or ().
-        load: normal impulses in addition to p, which friction includes; None: 0.
+        load: normal impulses in addition to x_n, which friction includes; None: 0.
+
+    Returns:
+        `Many`: the impulse of the least misfit, which the iteration need not end with.
 
     Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn,
     Negrut and Tasora, ACM Trans. Graph. 34 (2015) for granular media (there the cone is
@@ -138,9 +144,20 @@ def solve_many(
     unit = jnp.ones((), x.dtype)
     inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
     unknown = jnp.inf * unit
-    begin = _At(x, ax, x, ax, unit, inverse_step_size, x, unknown, jnp.int32(0))
+    begin = _At(
+        x=x,
+        ax=ax,
+        y=x,
+        ay=ax,
+        weight=unit,
+        inverse_step_size=inverse_step_size,
+        best=x,
+        misfit=unknown,
+        tries=jnp.int32(0),
+    )
     end = while_loop(going, iterate, begin)
     relative = end.misfit / jnp.where(size > 0, size, 1.0)
+    # a bound, in the units of `rate`
     residual = end.misfit * jnp.sqrt(jnp.max(diagonal))
     impulse = end.best * scale
     return Many(impulse, relative, residual, end.tries, end.inverse_step_size)

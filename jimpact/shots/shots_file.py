@@ -40,7 +40,10 @@ _OF_MOTIONS = {
 }
 # Share of a step by which times may be off, as they are when rounded to a few digits.
 # Ten times more would pass steps that visibly differ.
-UNEVEN_STEPS = 1e-3
+UNEVENNESS = 1e-3
+# Share of a step that the last digit of times may stand for: of more, steps that differ
+# look alike.
+LAST_DIGIT = 0.25
 _HEADER = re.compile(r"(t|[a-z_]+(?=_))(?:_([1-9][0-9]*))?\s*(?:\[([^]]*)\])?")
 _COMMENT = re.compile(r"comment(_.*)?")  # a column that is not read
 _ALLOWED = (
@@ -131,7 +134,7 @@ def _last_digit(cell: str) -> float:
 
 def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
     """Times (S,) in equal steps: as they are, or a line through them if they were
-    rounded.
+    rounded, to at most LAST_DIGIT of a step.
 
     Args:
         where: beginning of a message.
@@ -146,11 +149,12 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
         raise ValueError(f"{where}: the times `t` must be two or more, and rise.")
     duration = time[-1] - time[0]
     step = duration / (len(time) - 1)
-    even = time[0] + step * np.arange(len(time))
+    number = np.arange(len(time))
+    even = time[0] + step * number
     off = np.abs(time - even)
     # each end and the time between may be off by half of the last digit
-    allowed = UNEVEN_STEPS * step + min(rounding, step / 4)
-    if off.max() <= UNEVEN_STEPS * step:
+    allowed = UNEVENNESS * step + min(rounding, LAST_DIGIT * step)
+    if off.max() <= UNEVENNESS * step:
         return time
     if off.max() > allowed:
         k = int(off.argmax())
@@ -159,9 +163,8 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
             f"{time[k]:g} s is {off[k]:.2g} s off steps of {step:.6g} s; as they are "
             f"written they may be {allowed:.2g} s off."
         )
-    number = np.arange(len(time))
     slope, start = np.polyfit(number, time, 1)
-    return np.asarray(start + slope * np.arange(len(time)))
+    return np.asarray(start + slope * number)
 
 
 def _read(

@@ -148,7 +148,8 @@ def _box_multipliers(
     slack = jnp.where(bounded, slack, 1.0)  # a bound at infinity never binds
     matrix = jnp.block([[s, -s], [-s, s]])
     matrix = unit_outside(matrix, bounded)
-    # p = p_low - p_high is unique where S is regular, whatever the two parts are
+    # The matrix is singular, but only p_low - p_high is used. It is unique where S is
+    # regular; elsewhere any that keeps the bounds will do.
     solution = solve_lcp(matrix, slack, regular=True)
     of_low = solution.z[: len(y)]
     return of_low - solution.z[len(y) :], solution.code
@@ -344,9 +345,9 @@ def friction_energy_change(
 ) -> jax.Array:
     """`T+ - T-` [J] of normal and tangential impulses, in kinetic quasi-velocities.
 
-    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t
-    p_t / 2`, with `pbar = |grad f|
-    p`, H_t the tangents, and G, n_q, t_q as in `friction_bounds`.
+    Equation: the sum of `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2` and
+    `(qt+ + qt-)^T t_q^T H_t p_t / 2`, with `pbar = |grad f| p`, H_t the tangents, and
+    G, n_q, t_q as in `friction_bounds`.
 
     Args:
         scene: m contacts, planar tangents.
@@ -367,6 +368,7 @@ def friction_energy_change(
     >>> round(float(friction_energy_change(particle, [1.0, -1.0], [3.0], [-0.9])), 6)
     -1.4475
     """
+    # of its coefficients nothing is used
     coupling = _coupling(scene, 0.0, 0.0)
     p, p_t = (
         as_numbers(name, value, (scene.contacts,), "one per contact")

@@ -61,14 +61,17 @@ def divided(frames: Frames, acceleration: np.ndarray, shortest: int) -> Division
     """The cheapest division; a flight has at least `shortest` frames seen in every
     coordinate.
 
-    Equation: `best_j = min(best_(j-1) + lost, min_i best_i + price + chi^2(i..j))`:
+    Equation: `c_j = min(c_(j-1) + lost, min_i c_i + price + chi^2(i..j))`:
     frame j is lost, or the last one of a flight from i; dynamic programming.
     """
     search = _Search(frames, acceleration, shortest)
     for first in range(0, len(frames.t), BLOCK):
         search.add_block(first)
-    cost = float(search.best[-1])
+    cost = float(search.least_cost[-1])
     return Division(search.flights(), cost)
+
+
+SUMS = 6  # of each flight, see `_Starts`
 
 
 @dataclass
@@ -98,36 +101,42 @@ class _Starts:
 
 
 class _Search:
-    """State of the search: least cost `best` (T + 1,) of the first j frames, and where
-    from.
+    """State of the search for the cheapest division of T frames of n coordinates.
+
+    `least_cost` (T + 1,) of the first j frames, and `from_frame` (T + 1,), where what
+    ends there begins: a flight, or one lost frame.
     """
 
     def __init__(self, frames: Frames, acceleration: np.ndarray, shortest: int) -> None:
+        """Nothing divided yet; `acceleration` (n,) of free flights, `shortest` number
+        of frames of a flight.
+        """
         count, n = frames.q.shape
         highest = np.nanmax(frames.q, axis=0)
         extent = highest - np.nanmin(frames.q, axis=0)
-        largest = max(extent.max(), 1e-300)
+        largest = max(extent.max(), 1e-300)  # of what does not move, too, > 0
         self.t = frames.t
         self.good = np.isfinite(frames.q)
         self.sigma = np.maximum(frames.sigma, LEAST_NOISE * largest)
         self.q = np.where(self.good, frames.q, 0.0)
-        self.curve = acceleration / self.sigma
+        self.scaled_acceleration = acceleration / self.sigma
         self.shortest = shortest
-        # two frames have twice that
+        # sum of squares of times about their mean: that of two frames is twice this
         shortest_step = float(np.diff(frames.t).min())
         self.least_spread = shortest_step**2 / 4
         self.price = price(count, n)
-        self.lost = price_of_lost(n) * self.good.any(axis=1)
-        self.best = np.zeros(count + 1)
-        self.come = np.zeros(count + 1, int)
+        self.price_if_lost = price_of_lost(n) * self.good.any(axis=1)
+        self.least_cost = np.zeros(count + 1)
+        self.from_frame = np.zeros(count + 1, int)
         no_index = np.zeros(0, int)
-        no_sums = np.zeros((6, 0, n))
+        no_sums = np.zeros((SUMS, 0, n))
         self.starts = _Starts(no_index, no_sums)
-        self.time = frames.t[0]
-        self.place = self._place(0)
+        # sums are taken from an origin near their frames: they lose no digits
+        self.origin_time = frames.t[0]
+        self.origin_place = self._place(0)
 
     def add_block(self, first: int) -> None:
-        """Extend `best` by the frames of a block."""
+        """Extend `least_cost` by the frames of a block."""
         end = min(first + BLOCK, len(self.t))
         self._move_origin(first)
         within = self._sums_of(slice(first, end))  # (6, B + 1, n), from its start
@@ -139,22 +148,22 @@ class _Search:
         cost = self._costs(since_starts)
         late = index[:, None] > frames
         cost[late] = np.inf
-        of_old = self.best[self.starts.index]
+        of_old = self.least_cost[self.starts.index]
         unknown = np.full(len(new.index), np.inf)
         begun = np.concatenate([of_old, unknown])
         old = len(of_old)
         for k, j in enumerate(frames):
-            begun[old + k] = self.best[j]
+            begun[old + k] = self.least_cost[j]
             total = begun + cost[:, k]
             i = int(np.argmin(total))
-            left_out = self.best[j] + self.lost[j]
+            left_out = self.least_cost[j] + self.price_if_lost[j]
             flown = total[i] + self.price
-            self.best[j + 1] = min(left_out, flown)
+            self.least_cost[j + 1] = min(left_out, flown)
             if flown < left_out:
-                self.come[j + 1] = index[i]
+                self.from_frame[j + 1] = index[i]
             else:
-                self.come[j + 1] = j
-        worse = begun + cost[:, -1] + self.price - self.best[end]
+                self.from_frame[j + 1] = j
+        worse = begun + cost[:, -1] + self.price - self.least_cost[end]
         stays = self._stays(index, worse, end)
         to_end = sums[:, stays] + within[:, None, -1]
         self.starts = _Starts(index[stays], to_end)
@@ -164,7 +173,7 @@ class _Search:
         last = len(self.t)
         found = []
         while last > 0:
-            first = int(self.come[last])
+            first = int(self.from_frame[last])
             if last - first >= self.shortest:
                 found.append(np.arange(first, last))
             last = first
@@ -177,29 +186,29 @@ class _Search:
         some = slice(k, k + BLOCK)
         first = k + self.good[some].argmax(axis=0)
         c = np.arange(len(first))  # coordinates
-        last_origin = getattr(self, "place", np.zeros(len(c)))
+        last_origin = getattr(self, "origin_place", np.zeros(len(c)))
         seen = self.good[first, c]
         return np.where(seen, self.q[first, c], last_origin)
 
     def _move_origin(self, first: int) -> None:
         """Take the first frame of a block as origin of times and places."""
-        dx = self.t[first] - self.time
+        dx = self.t[first] - self.origin_time
         place = self._place(first)
-        moved = (place - self.place) / self.sigma
-        offset = self.curve * dx**2 / 2 - moved
-        slope = self.curve * dx
+        moved = (place - self.origin_place) / self.sigma
+        offset = self.scaled_acceleration * dx**2 / 2 - moved
+        slope = self.scaled_acceleration * dx
         self.starts = self.starts.moved(dx, slope, offset)
-        self.time = self.t[first]
-        self.place = place
+        self.origin_time = self.t[first]
+        self.origin_place = place
 
     def _sums_of(self, some: slice) -> np.ndarray:
         """Sums (6, B + 1, n) of `_Starts` from the start of a block to each of its
         frames.
         """
         w = self.good[some].astype(float)
-        x = (self.t[some] - self.time)[:, None]
-        apart = (self.q[some] - self.place) / self.sigma
-        y = w * (apart - self.curve * x**2 / 2)
+        x = (self.t[some] - self.origin_time)[:, None]
+        apart = (self.q[some] - self.origin_place) / self.sigma
+        y = w * (apart - self.scaled_acceleration * x**2 / 2)
         terms = np.stack([w, w * x, w * x**2, y, x * y, y * y])
         zero = np.zeros_like(terms[:, :1])
         sums = terms.cumsum(axis=1)

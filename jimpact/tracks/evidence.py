@@ -455,46 +455,80 @@ def _joined(
 ) -> Verdict:
     """Flights, neighbours joined where one costs less than two, until none does.
 
-    Of neighbouring pairs that would be joined the one that saves more is.
+    In each round the pairs that cost least among their neighbours are joined. The
+    verdict counts who explained them: errors of the places (`_Joining.by_line`), or a
+    bend of the flight (`by_bend`).
     """
     flights = list(flights)
-    start = price(*frames.q.shape)
-    counts = {"errors": 0, "bends": 0}
+    by_errors = 0
+    by_bends = 0
     costs = FlightCosts(frames, flight, errors)
-    of_waves = OF_WAVES * errors.speeds_of_waves
     while len(flights) > 1:
-        alone = costs.of(flights)
-        both = costs.of_pairs(flights)
-        two = np.add(*neighbours(alone.least))
-        by_line = both.line - two - start
-        by_bend = both.least - two + LEAST_GAIN
-        jumps = np.abs(alone.jumps())
-        in_waves = jumps / np.maximum(of_waves, 1e-300)
-        beyond = in_waves.max(axis=1)
-        saves = np.minimum(by_line, by_bend)
-        within = np.minimum(saves, beyond - 1)
-        saves = np.where(beyond < 1, within, saves)
-        before = np.append(np.inf, saves)[:-1]
-        _, after = neighbours(np.append(saves, np.inf))
-        best = (saves <= before) & (saves <= after)
-        chosen = np.flatnonzero((saves < 0) & best)
-        if not chosen.size:
+        joining = _Joining.of(costs, flights, frames, errors)
+        pairs = joining.pairs()
+        if not pairs:
             break
-        taken: list[int] = []
-        for k in map(int, chosen):  # of equal neighbours the first
-            if not taken or k > taken[-1] + 1:
-                taken.append(k)
-        for k in reversed(taken):
-            if by_line[k] <= by_bend[k]:
-                counts["errors"] += 1
+        for k in reversed(pairs):
+            if joining.by_line[k] <= joining.by_bend[k]:
+                by_errors += 1
             else:
-                counts["bends"] += 1
-            two = slice(k, k + 2)
-            flights[two] = [np.concatenate(flights[two])]
+                by_bends += 1
+            both = slice(k, k + 2)
+            flights[both] = [np.concatenate(flights[both])]
     n = frames.q.shape[1]
     straight = np.zeros((len(flights), n), bool)
-    by_errors = counts["errors"]
-    return Verdict(flights, flight, errors, straight, by_errors, counts["bends"])
+    return Verdict(flights, flight, errors, straight, by_errors, by_bends)
+
+
+class _Joining(NamedTuple):
+    """What neighbours (F - 1,) cost as one flight, more than as two; < 0: less.
+
+    Fields: cost of one line, which saves the price of a flight; of one flight that may
+    bend, which must save LEAST_GAIN; and the jump of velocities over OF_WAVES of that
+    of waves.
+    """
+
+    by_line: np.ndarray
+    by_bend: np.ndarray
+    jump: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        costs: "FlightCosts",
+        flights: Sequence[np.ndarray],
+        frames: Frames,
+        errors: Errors,
+    ) -> "_Joining":
+        """Costs of joining these flights by these errors."""
+        alone = costs.of(flights)
+        both = costs.of_pairs(flights)
+        apart = np.add(*neighbours(alone.least))
+        of_waves = OF_WAVES * errors.speeds_of_waves
+        jumps = np.abs(alone.jumps()) / np.maximum(of_waves, 1e-300)
+        return cls(
+            by_line=both.line - apart - price(*frames.q.shape),
+            by_bend=both.least - apart + LEAST_GAIN,
+            jump=jumps.max(axis=1),
+        )
+
+    def pairs(self) -> list[int]:
+        """The first of each two flights that are to be joined: they cost less so, or
+        waves explain their jump, and their neighbours cost more; of equal ones the
+        first.
+        """
+        extra_cost = np.minimum(self.by_line, self.by_bend)
+        # whatever it costs where the jump is that of waves
+        by_waves = np.minimum(extra_cost, self.jump - 1)
+        extra_cost = np.where(self.jump < 1, by_waves, extra_cost)
+        before = np.append(np.inf, extra_cost)[:-1]
+        _, after = neighbours(np.append(extra_cost, np.inf))
+        cheapest = (extra_cost <= before) & (extra_cost <= after)
+        taken: list[int] = []
+        for k in map(int, np.flatnonzero((extra_cost < 0) & cheapest)):
+            if not taken or k > taken[-1] + 1:
+                taken.append(k)
+        return taken
 
 
 def doubtful(

@@ -248,7 +248,7 @@ def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
     first = np.zeros(len(t), bool)
     first[starts] = True
     z[first] = 0.0
-    moved, still = _free(z)
+    moved, still = _free_oscillation(z)
     noise_ff, noise_fg, noise_gg = _noise(z)
     q_ff = np.where(first, 1.0, noise_ff)
     q_fg = np.where(first, 0.0, noise_fg)
@@ -285,9 +285,10 @@ def steps_of(t: np.ndarray, starts: np.ndarray, time: float) -> Steps:
     return Steps(of_frame, with_next, np.log(det))
 
 
-def _free(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`exp(-b z) sin(c z) / c` and `exp(-b z) cos(c z)` of steps z of a free
-    oscillator."""
+def _free_oscillation(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`h = exp(-b z) sin(c z) / c` and `exp(-b z) cos(c z) = h' + b h` of steps z (..)
+    of a free oscillator after a push; b = DAMPING, c = FREQUENCY.
+    """
     decay = np.exp(-DAMPING * z)
     angle = FREQUENCY * z
     sine = decay * np.sin(angle) / FREQUENCY
@@ -300,7 +301,7 @@ def _noise(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Equation: with h = `exp(-b u) sin(c u) / c` it is `4 b int_0^z (h^2, h h', h'^2)
     du`, the second `2 b h(z)^2`: by polynomials up to SHORT, `1 - A A^T` beyond.
     """
-    h, still = _free(z)
+    h, still = _free_oscillation(z)
     up = still + DAMPING * h
     down = still - DAMPING * h
     far = z > SHORT
@@ -315,10 +316,11 @@ def _noise(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _integrals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`4 b int_0^z h^2 du / z^3` and `4 b int_0^z h'^2 du / z` of `_noise`, by
-    quadrature."""
+    quadrature; of z (k,) without unit, b = DAMPING.
+    """
     points, weights = np.polynomial.legendre.leggauss(DEGREE)
     share = (1 + points) / 2
-    h, still = _free(z[:, None] * share)
+    h, still = _free_oscillation(z[:, None] * share)
     rate = still - DAMPING * h
     scale = 2 * DAMPING * weights
     of_places = (scale * h**2).sum(axis=1)
