@@ -83,8 +83,8 @@ class PendulumCradle(Body):
         return across / (jnp.sqrt(right**2 + up**2) + touching)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """The least gap () [m] between balls that are no neighbours: they have no
-        contact.
+        """The least gap () [m] between balls that are no neighbours, which have no
+        contact; of fewer than three balls that of any body.
         """
         i, j = np.triu_indices(self.masses.shape[0], 2)
         if not len(i):
@@ -94,10 +94,10 @@ class PendulumCradle(Body):
         first = jnp.zeros_like(between[:1])
         suspensions = jnp.concatenate([first, jnp.cumsum(between)])
         right = suspensions + self.length * jnp.sin(q)
-        up = self.length * jnp.cos(q)
+        down = self.length * jnp.cos(q)
         across = right[i] - right[j]
-        rise = up[i] - up[j]
-        apart = jnp.sqrt(across**2 + rise**2)
+        drop = down[i] - down[j]
+        apart = jnp.sqrt(across**2 + drop**2)
         gaps = apart - self.radius[i] - self.radius[j]
         return jnp.min(gaps)
 

@@ -626,7 +626,8 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
     Args:
         scene: n coordinates, m contacts.
         impulse: p (m,) [N s].
-        tangential: p_t, one per tangent of the scene [N s]; None: 0.
+        tangential: p_t, one per tangent of the scene [N s]; None: 0. Not used where the
+            scene has no tangents.
 
     Returns:
         The change of v (n,) [m/s].
@@ -645,14 +646,14 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
         check_shape(
             "tangential", tangential, scene.tangents.shape[1:], "one per tangent"
         )
-    if scene.pairs is not None:
+    if scene.pairs is not None:  # normals of many bodies, without tangents
         return solve_mass(scene, scene.pairs.push(impulse))
-    if scene.walls is None:
+    if scene.walls is None:  # any scene
         push = scene.normals @ impulse
         if scene.tangents is not None and tangential is not None:
             push = push + scene.tangents @ tangential
         return solve_mass(scene, push)
-    left, right = scene.walls
+    left, right = scene.walls  # a chain: a body takes the impulses on both sides
     padded = jnp.pad(impulse, (int(not left), int(not right)))
     return -jnp.diff(padded) / scene.mass
 

@@ -600,8 +600,9 @@ class FrictionFlow(ContactFlow):
         With its normal impulse p gamma grows at the rate `1 + K_nt r`, u at
         `K_nt + K_tt r`, where r = lambda / F: `drag` = -mu sign(u) until slip stops,
         from then on `hold`, -K_nt / K_tt, or +-mu where that is beyond the cone: slip
-        then begins anew, to the other side. A contact that is not at work stays as it
-        is, but for x = 0.
+        then begins anew, to the other side. It is a sequence of at most PIECES pieces,
+        each of which slides or not, and compresses or expands, by the energy that the
+        restitution leaves. A contact that is not at work stays as it is, but for x = 0.
         """
         works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
         rows = self.friction_rows(y)
@@ -617,14 +618,16 @@ class FrictionFlow(ContactFlow):
         hold = jnp.sign(hold) * size
         du = k_nt + k_tt * drag  # over dp, while it slides
         stops = (sign != 0) & (u * du < 0)
-        length = quotient(-u, du, where=stops, otherwise=jnp.inf)
-        length = jnp.where(sign == 0, 0.0, length)
+        # normal impulse until slip stops
+        until_stop = quotient(-u, du, where=stops, otherwise=jnp.inf)
+        until_stop = jnp.where(sign == 0, 0.0, until_stop)
         stored = power(x, plus_one(self.exponent))
         energy = jnp.where(x > 0, stored, 0.0)
         start = SingleContact(
+            # of a contact not at work any: its result is not used
             gap_velocity=jnp.where(works, gamma, -1.0),
             energy=energy,
-            left=length,
+            left=until_stop,
             sliding=0 * rows.p,
             holding=0 * rows.p,
         )

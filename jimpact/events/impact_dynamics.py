@@ -247,8 +247,10 @@ def coupling_of(problem: Problem, structure: Structure) -> Coupling:
 def first_indentation(
     problem: Problem, exponent: Exponent | None
 ) -> Float[Array, "m *B"]:
-    """Indentations before the impact: `energy^(1 / (eta + 1))` if loaded, else minus
-    the gap, or 0.
+    """Indentations before the impact: `energy^(1 / (eta + 1))` of loaded contacts, else
+    minus the gap, or 0 without gaps.
+
+    eta is that of the problem, where it has one that may be traced, else `exponent`.
     """
     eta: Any = exponent
     if problem.exponent is not None:
@@ -640,8 +642,9 @@ def is_ill_conditioned(
     code: Int[Array, "2"],
     error: Float[Array, ""],
 ) -> Bool[Array, ""]:
-    """True if velocities of two runs (columns) differ by over ILL `error`, or the
-    second failed.
+    """True if velocities of two runs (columns), the second one at a finer tolerance and
+    from data changed in their last digits, differ by more than ILL `error` [m/s], or
+    the second one failed.
     """
     first, second = p.T
     difference_t = None
@@ -651,7 +654,8 @@ def is_ill_conditioned(
     change = velocity_changes(contact, second - first, difference_t)
     close = jnp.all(jnp.abs(change) <= ILL * error)
     _, second_code = code
-    return ~(close & (second_code <= CODE["plastic_limit"]))
+    is_resolved = second_code <= CODE["plastic_limit"]  # codes beyond are failures
+    return ~(close & is_resolved)
 
 
 def perturbed(problem: Problem) -> Problem:

@@ -660,7 +660,8 @@ def run(
     `flow` and `start` may have tangents (`Dual`), which are carried along. With
     `checkpoints` the loop has a reverse mode, and no forward mode.
     `observe(seen, state, accepted)` follows the states before each step, and which
-    impacts (1, B) accept it.
+    impacts (1, B) accept it, from `seen` on; without it an impact that is over makes
+    room for the next one of a batch.
     """
     start = with_tangents_of((flow, start), start)
     length = FIRST * jnp.ones_like(value_of(flow.tolerance))

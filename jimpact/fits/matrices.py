@@ -185,16 +185,17 @@ class AdmissibleMatrices(eqx.Module):
             of a set that contains the admissible one.
             """
             z = state.z
-            energy, tangent = (x[linear_count:] for x in self.conditions(z))
-            which = jnp.argsort(energy)[:worst]
-            # the tangents at y
-            slack_at_y = energy[which] + tangent[which] @ (y - z)
-            new = slack_at_y, tangent[which]
+            slack, slope = (x[linear_count:] for x in self.conditions(z))
+            which = jnp.argsort(slack)[:worst]
+            # of the tangents at y, from which the program starts
+            slack_at_y = slack[which] + slope[which] @ (y - z)
+            new = slack_at_y, slope[which]
             parts = zip(linear, (state.slacks, state.slopes), new)
             slacks, slopes = map(jnp.concatenate, parts)
             move, multipliers, solved = _quadratic(hessian, gradient, slacks, slopes)
             active = linear_count + jnp.argsort(-multipliers[linear_count:])[:size]
-            inside = (energy.min() >= -rounding) & (state.steps > 0)
+            # y itself has not been through the program yet
+            inside = (slack.min() >= -rounding) & (state.steps > 0)
             goes_on = solved & ~inside
             z = jnp.where(goes_on, y + move, z)
             next_step = state.steps + 1

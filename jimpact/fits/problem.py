@@ -414,6 +414,7 @@ class FitProblem:
         outcomes: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
         if bare.before is not None:
             outcomes += (np.zeros((*shape, shape[-1]), dtype), np.zeros(shape, dtype))
+        # those of the priors of all variables come last
         residual = np.zeros(math.prod(shape) + q, dtype)
         project = None
         if self.matrix is not None:

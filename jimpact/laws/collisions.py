@@ -356,9 +356,9 @@ def collide(
 ) -> CollisionState:
     """State after the free flight to the next collision and this collision.
 
-    Equation: impulse `s = -(1 + e_j) qn_j` at the contact j that collides,
-    `qn += G_j s`; with friction or correlation ratios impulses of `_with_friction`,
-    `_correlated`.
+    Equation: impulse `p_j = -(1 + e_j) qn_j` at the contact j that collides,
+    `qn += G_j p_j`; with correlation ratios those of `_correlated`, else with friction
+    those of `_with_friction`. Without gaps no time passes between collisions.
     """
     choice = choose(inputs, options, g, jax.lax.stop_gradient(now))
     qn = now.qn
@@ -385,7 +385,8 @@ def collide(
         code = jnp.maximum(code, status)
     gaps = now.gaps
     if gaps is not None:
-        flown = gaps + jax.lax.stop_gradient(qn) * inputs.root * choice.wait
+        gamma = jax.lax.stop_gradient(qn) * inputs.root
+        flown = gaps + gamma * choice.wait
         gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
     return CollisionState(
         qn=after,

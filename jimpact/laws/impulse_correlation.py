@@ -103,9 +103,9 @@ class ImpulseCorrelation(Law):
             contact.delassus,
             contact.gap_velocity,
             self.restitution,
-            None,
-            None,
-            self.max_collisions,
+            gaps=None,
+            cycle=None,
+            max_collisions=self.max_collisions,
             ratio=self.ratio,
         )
         return Impulses(p, None, end.code)

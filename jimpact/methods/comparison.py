@@ -97,21 +97,21 @@ class Comparison(Tabular):
         any.
 
         Equation: `sqrt(mean_i (M_ii / max M_ii) (v_i+ - measured_i)^2)`, weights of 1
-        in a chain: rotations in rad/s count as m/s with as much energy.
+        in a chain: rotations in rad/s count as m/s with as much energy. Coordinates
+        that were not measured (NaN) are left out.
         """
         if self.measured is None:
             return {}
-        weight = np.ones(self.scene.size)
+        root_weight = np.ones(self.scene.size)
         if self.scene.walls is None:
             inertia = np.diag(dense_mass(self.scene))
-            weight = np.sqrt(inertia / inertia.max())
+            root_weight = np.sqrt(inertia / inertia.max())
         after = {name: entry.outcome.velocity for name, entry in self.entries.items()}
-        return {
-            name: float(
-                np.sqrt(np.nanmean((weight * (np.asarray(v) - self.measured)) ** 2))
-            )
+        off = {
+            name: root_weight * (np.asarray(v) - self.measured)
             for name, v in after.items()
         }
+        return {name: float(np.sqrt(np.nanmean(x**2))) for name, x in off.items()}
 
     @property
     def closest(self) -> tuple[str, ...]:

@@ -178,10 +178,11 @@ def _at_start(
     start: Float[Array, ""],
     end: Float[Array, ""],
 ) -> _AtStart:
-    """Values of the functions of a system at (q, v, start), which `check_functions` has
-    checked.
+    """Values of the functions of a system at (q, v, start), after `check_functions`;
+    loads that it does not have are left out.
 
-    The base is taken at equally spaced instants from start to end.
+    The base is taken at equally spaced instants from start to end, as it must be finite
+    all the time.
     """
     check_functions(system, q, v, start)
     body = system.body

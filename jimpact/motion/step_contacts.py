@@ -163,7 +163,9 @@ class ActiveContacts(NamedTuple):
         def one(
             row: Int[Array, ""], diagonal: Float[Array, "m b"]
         ) -> Float[Array, "m b"]:
-            """Diagonal with the part of one block of contacts."""
+            """Diagonal of the Delassus matrix with that of one block of contacts:
+            `sum D^2 / mass` over two bodies and their velocities.
+            """
             bodies = block(pairs.bodies, row)
             directions = block(pairs.directions, row)
             inverse = self.inverse[bodies][:, None]

@@ -279,9 +279,10 @@ def event_numbers(old: State, after: After) -> Float[Array, " w"]:
 def recorded_events(
     table: MotionTable, count: Int[Array, ""], problem: MotionProblem
 ) -> Events:
-    """Record of the first `count` events of a table; NaN or 0 in rows that are not
-    used.
+    """Record of the first `count` events of a table, with the columns of
+    `event_width`; NaN or 0 in rows that are not used.
     """
+    # the last row of a table takes what no longer fits
     index = jnp.arange(len(table.events) - 1, dtype=count.dtype)
     used = index < count
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
@@ -291,10 +292,11 @@ def recorded_events(
     others = (problem.q0.size, n, n, m, problem.tangents, 2 * m)
     sizes = np.cumsum([1, *others])
     parts = jnp.split(rows, sizes, axis=1)
-    time, q, before, after, impulse, side, energy, passed = parts
+    time, q, before, after, impulse, side, energy, accumulation = parts
     kind = marks[:, 0]
     ends = kind == KIND_CODE["accumulation"]
-    later = time[:, 0] + passed[:, 0]
+    duration, gap = accumulation.T
+    later = time[:, 0] + duration
     return Events(
         count=count,
         time=time[:, 0],
@@ -305,8 +307,8 @@ def recorded_events(
         velocity_after=after,
         impulse=impulse,
         tangential_impulse=side,
-        energy=energy.reshape(-1, 2, m),
+        energy=energy.reshape(-1, 2, m),  # of normal and of tangential impulses
         status=marks[:, 1],
         accumulation_end=jnp.where(ends, later, jnp.nan),
-        accumulation_gap=jnp.where(ends, passed[:, 1], jnp.nan),
+        accumulation_gap=jnp.where(ends, gap, jnp.nan),
     )

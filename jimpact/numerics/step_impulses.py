@@ -106,8 +106,9 @@ def descent_lengths(
 
     Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the
     largest eigenvalue is then at most the largest sum of a row, and the fourth root of
-    the Frobenius norm of the fourth power. `friction_only`: normal impulses are known,
-    so their rows do not count.
+    the Frobenius norm of the fourth power. `coupling` K has the normals of the contacts
+    first, then the tangents of one contact after another; rows of diagonal 0 count as
+    of size 1. `friction_only`: normal impulses are known, so their rows do not count.
 
     Equation: `1 / d_i = size_i min(max_j sum_k |S_jk|, |S^4|^(1/4))` with the scaled
     matrix S.
@@ -116,11 +117,11 @@ def descent_lengths(
     size = coupling[jnp.arange(n), jnp.arange(n)]
     lanes = size.shape[-1]
     side = size[contacts:].reshape(contacts, -1, lanes)
-    rows = side.shape[1]
-    if rows:
+    tangents = side.shape[1]  # of a contact
+    if tangents:
         of_contacts = jnp.max(side, axis=1)
-        largest = jnp.repeat(of_contacts, rows, axis=0)
-        size = jnp.concatenate([size[:contacts], largest])
+        of_tangents = jnp.repeat(of_contacts, tangents, axis=0)
+        size = jnp.concatenate([size[:contacts], of_tangents])
     size = jnp.where(size > 0, size, 1.0)
     root = jnp.sqrt(size)
     scaled = coupling / (root[:, None] * root[None])
@@ -239,7 +240,7 @@ def _solve_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
     """Tangent dq of the impulses, from `R(q) = q - projected(q - d w(q)) = 0`: R_q dq =
     -dR.
 
-    The error that is left has no tangent.
+    The error that is left has no tangent, as start and tolerance have none.
     """
     problem = primals[0]
     change, _, _ = tangents

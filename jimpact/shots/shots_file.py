@@ -397,9 +397,9 @@ def _number(where: str, column: CsvColumn, cell: str) -> float:
 
 def _check_error(where: str, column: CsvColumn, measured: bool, error: float) -> None:
     """Raise a ValueError if the standard error of a measured value is missing or not
-    positive.
+    positive; before the impact, of bodies known to be at rest, it may be 0.
     """
-    exact = column.kind == "sigma_pre" and error == 0  # as of what is at rest
+    exact = column.kind == "sigma_pre" and error == 0
     if measured and not error > 0 and not exact:
         if np.isnan(error):
             value = "is empty"

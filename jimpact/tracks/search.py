@@ -279,14 +279,17 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
     1. Fit the arcs; first at fixed instants, as nothing determines one without a jump.
     2. Join two flights without a jump of SMALLEST_JUMP, or as `_without_false` says;
        fit again.
-    3. Find waves again, where flights that have them were joined; fit again.
-    4. Take the errors of the residuals, where they are unknown or clearly larger, and
-       those of times, where residuals grow with the speed; fit again.
+    3. Find the errors again, where flights with waves were joined; fit again.
+    4. Take the errors of the residuals, where they are unknown, or clearly larger in
+       most flights; then also those of times, where residuals grow with the speed; fit
+       again.
+
+    A coordinate in which all flights bend has no acceleration in common.
     """
     verdict = search.verdict
     contact = search.settings.contact
-    by_all = np.all(verdict.bent, axis=0)
-    flight = verdict.flight.without_common(by_all)
+    bent_in_all = np.all(verdict.bent, axis=0)
+    flight = verdict.flight.without_common(bent_in_all)
     start = Start(verdict.flights, flight, verdict.errors, verdict.bent, contact)
     moving = False
     while True:
@@ -308,8 +311,8 @@ def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
         arcs = _arcs(search.frames, start)
     sigma = of_residuals(arcs, search.frames)
     given = start.errors.sigma
-    error = BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs))
-    larger = of_most_flights(arcs) > given * (1 + error)
+    relative_error = BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs))
+    larger = of_most_flights(arcs) > given * (1 + relative_error)
     if search.settings.estimated or larger.any():
         if not search.settings.estimated:
             sigma = np.where(larger, sigma, given)

@@ -261,11 +261,15 @@ class Track:
     def _with_errors_of_poses(
         self, body: Body, near: float, kept: np.ndarray
     ) -> np.ndarray:
-        """Covariance (2nK, 2nK) of (v-, v+ - F q) of all impacts, F of
-        `slopes_in_pose` of those that are `kept`, q the error of the pose.
+        """Covariance (2nK, 2nK) of (v-, v+ - F q) of K impacts in n coordinates, q the
+        error of the pose.
+
+        F is that of `slopes_in_pose` of impacts that are `kept` (their indices), 0 of
+        others; contacts with gaps up to `near` [m] take part.
         """
         n = len(self.units)
         count = len(self.impacts)
+        # of (v-, v+, q) of each impact
         gain = np.zeros((count, 2 * n, count, 3 * n))
         for k in range(count):
             gain[k, :, k, : 2 * n] = np.eye(2 * n)
