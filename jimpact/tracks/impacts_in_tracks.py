@@ -28,6 +28,7 @@ from jimpact.tracks.search import Settings, doubts, fitted_arcs, searched, windo
 from jimpact.tracks.spin import Spin, spin_of
 from jimpact.tracks.track import Track, TrackImpact
 from jimpact.tracks.turning_alone import with_impacts_of_turning
+from jimpact.tracks.unwrapping import unwrapped
 
 VELOCITY_OF = {"m": LINEAR, "rad": ANGULAR}
 
@@ -61,8 +62,8 @@ def find_impacts(
     Args:
         t: times of the frames, rising (T,) [s].
         q: coordinates (T,) or (T, n) [m] or [rad]; NaN where the body was lost. An
-            angle goes on beyond pi, or is unwrapped where `units` say 'rad'. The
-            velocities are the rates of q.
+            angle goes on beyond pi, or is unwrapped where `units` say 'rad', over lost
+            frames by the rates beside them. The velocities are the rates of q.
         sigma: standard errors of q, a number or (n,), > 0; None: estimated from the
             residuals. Residuals that are clearly larger than a given sigma take its
             place, and are told.
@@ -124,7 +125,7 @@ def find_impacts(
     t, q, names = _checked(t, q, shortest, units)
     n = q.shape[1]
     raw = q
-    q = _unwrapped(q, names)
+    q = _unwrapped(t, q, names)
     rough = noise(t, q)
     if sigma is None:
         given = rough
@@ -153,7 +154,7 @@ def find_impacts(
     notes += findings_of_doubts(doubtful)
     left_out = len(search.verdict.flights) - len(flights)
     candidates = notes_of(search, left_out)
-    track = _as_track(t, _unwrapped(raw, names), arcs, names, doubtful)
+    track = _as_track(t, _unwrapped(t, raw, names), arcs, names, doubtful)
     return replace(track, warnings=tuple(notes), candidates=tuple(candidates))
 
 
@@ -354,14 +355,14 @@ def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
     return np.broadcast_to(array, (n,)).copy()
 
 
-def _unwrapped(q: np.ndarray, units: tuple[str, ...]) -> np.ndarray:
+def _unwrapped(t: np.ndarray, q: np.ndarray, units: tuple[str, ...]) -> np.ndarray:
     """Coordinates (T, n) in which angles, in frames that were seen, have no steps of 2
     pi.
     """
     q = q.copy()
     for c in np.flatnonzero(np.array(units) == "rad"):
         seen = np.isfinite(q[:, c])
-        q[seen, c] = np.unwrap(q[seen, c])
+        q[seen, c] = unwrapped(t[seen], q[seen, c])
     return q
 
 

@@ -654,3 +654,30 @@ def test_a_study_of_bounces(tmp_path):
 def test_studies_of_tracks_name_the_key_that_is_wrong(tmp_path, old, new, words):
     with pytest.raises(ValueError, match=words):
         ji.read_study(written(tmp_path, old, new))
+
+
+@pytest.mark.parametrize(
+    ("rate", "later", "lost"),
+    [(9.0, 9.0, 40), (25.0, 12.0, 25), (-30.0, 10.0, 40), (50.0, 50.0, 30)],
+)
+def test_angles_turn_on_while_frames_are_lost(rate, later, lost):
+    """More than half a turn in the gap: the angles of an encoder or of pictures, in any turn."""
+    rng = np.random.default_rng(1)
+    t = np.arange(200) / 100
+    since = t - 1.4  # [s] the impact
+    angle = np.where(since < 0, rate, later) * since
+    place = np.where(since < 0, 0.5, -0.3) * since
+    noise = [1e-3, 5e-3] * rng.normal(size=(200, 2))
+    q = np.column_stack([place, angle]) + noise
+    units = ["m", "rad"]
+    whole = ji.tracks.find_impacts(t, q, units=units)
+    q[50 : 50 + lost] = np.nan
+    of_pictures = q.copy()
+    of_pictures[:, 1] = np.angle(np.exp(1j * q[:, 1]))
+    for seen in (q, of_pictures):
+        track = ji.tracks.find_impacts(t, seen, units=units)
+        (impact,) = track.impacts
+        (known,) = whole.impacts
+        assert impact.time == pytest.approx(1.4, abs=5 * impact.time_error)
+        np.testing.assert_allclose(impact.pre[1], rate, atol=0.05)
+        np.testing.assert_allclose(impact.post, known.post, atol=0.01)

@@ -274,6 +274,35 @@ def test_a_study_of_poses(tmp_path):
     assert abs(ji.read_study(path).track.drag) < 1.0
 
 
+@pytest.mark.parametrize("spin", [20.0, 30.0])
+def test_a_ball_that_turns_fast_has_no_jumps_but_its_own(spin):
+    """Up to a third of a radian between frames: errors of sums of turns are no impacts."""
+    t = np.arange(100) / 100
+    before = np.array([spin, 0.0, 0.0])
+    after = before + np.array([-0.5, 0.4, 0.3])
+    for seed in range(7):
+        rng = np.random.default_rng(seed)
+        places = np.outer(t, [0.2, 0.1, 1.5]) - np.outer(t**2, [0, 0, G / 2])
+        places += 1e-3 * rng.normal(size=places.shape)
+        noise = Rotation.from_rotvec(5e-3 * rng.normal(size=places.shape))
+        since = (t - 0.5)[:, None]
+        found, none = (
+            ji.tracks.find_impacts(
+                t,
+                np.hstack([places, (Rotation.from_rotvec(turned) * noise).as_quat()]),
+                acceleration=[0, 0, -G],
+                quaternion="xyzw",
+            )
+            for turned in (np.where(since < 0, before, after) * since, before * since)
+        )
+        assert not none.impacts
+        (impact,) = found.impacts
+        omega = np.concatenate([impact.pre[3:] - before, impact.post[3:] - after])
+        errors = np.sqrt(np.diag(impact.covariance))
+        of_omega = np.concatenate([errors[3:6], errors[9:]])
+        assert np.abs(omega / of_omega).max() < 4.5
+
+
 def test_impacts_that_change_the_turning_alone_are_found():
     """A ball in flight whose spin alone jumps; without a jump none is found."""
     rng = np.random.default_rng(31)
