@@ -52,7 +52,7 @@ def test_a_motion_is_fitted_by_any_method():
         ji.fit_motion(pushed, ji.Newton(0.7), measured, *start, method=method)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_start_gravity_and_floor_of_a_motion_are_fitted_by_name():
     """A ball over a floor 5 cm above the zero of its heights, in two motions too."""
     rng, true = np.random.default_rng(0), ji.System(ji.Column([1.0]), gravity=9.7)

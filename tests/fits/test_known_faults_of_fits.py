@@ -23,7 +23,7 @@ WALL_SHOTS = np.array(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.long_run
 def test_a_fit_of_four_balls_and_a_wall_reaches_its_minimum():
     """chi^2 is 56.2206 by MINPACK on `ji.impact` and its Jacobian."""

@@ -299,6 +299,7 @@ def test_restitution_of_a_pair():
     assert float(ji.calibrate(ji.Hertz(1.0), 0.4, 1.0, 1.0).restitution) == 0.4
 
 
+@pytest.mark.slow
 def test_damping_of_a_users_own_force_is_calibrated():
     """The same force as Hunt and Crossley's, whose damping is known: value and slope in e."""
 
@@ -331,6 +332,7 @@ def test_restitution_of_a_force_that_only_a_coarser_tolerance_follows():
     np.testing.assert_allclose(measured, -out.velocity[0] / 0.7, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_impact_of_a_pair_without_an_end_says_why():
     pulls = ji.UserForce(lambda x, rate, p: jnp.zeros_like(x), None)
     with pytest.warns(UserWarning, match="ends with"):

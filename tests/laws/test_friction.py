@@ -470,6 +470,7 @@ def test_lzb_of_a_flat_block():
         close(out.velocity[i], found, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_contacts_that_stick_together_share_friction_in_proportion_to_mu_f():
     """lambda_j / (mu_j F_j) are equal where tangents are, whatever the arms of the normals."""
     tangents = [[1, 1], [0, 0], [0.1, 0.1]]

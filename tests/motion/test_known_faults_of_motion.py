@@ -140,7 +140,7 @@ def test_a_corner_that_slides_over_an_edge_takes_no_energy():
     assert not known[-3:].any()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_bodies_at_rest_stay_in_contact():
     """Rounding was a jump of a normal to them: a detachment at each sample, derivatives NaN."""
     beads = ji.System(ji.Column([1.0, 1.0]), gravity=True)

@@ -152,8 +152,8 @@ def documents(paths, long_run=()):
     ]
 
 
-LONGEST = ("mujoco", "gradient_descent", "speed_accuracy", "waves")
-LONGEST += ("02", "03", "05", "06", "07", "08", "09")
+LONGEST = ("mujoco", "gradient_descent", "speed_accuracy", "waves", "motions")
+LONGEST += ("01", "02", "03", "05", "06", "07", "08", "09")
 LONGEST += ("10", "11", "12", "13", "14", "15", "16", "17", "18", "19")
 
 

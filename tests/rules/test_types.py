@@ -77,7 +77,7 @@ def test_unknown_names_are_attribute_errors():
         _ = ji.no_such_name
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_mypy_sees_names_signatures_and_fields():
     command = [
         sys.executable,
