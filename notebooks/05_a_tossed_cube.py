@@ -50,9 +50,9 @@ poses = {
     "four": [1, 0, 0, 0],
 }
 for axes, (name, e) in zip(figure.subplots(1, 3), poses.items()):
-    box, shadow = cube.outlines(
-        np.asarray(cube.touching(np.array(e) / np.linalg.norm(e))), 0.0
-    )
+    pose = np.asarray(cube.touching(np.array(e) / np.linalg.norm(e)))
+    (box,) = cube.outlines(pose, 0.0)
+    (shadow,) = cube.shadows(pose)
     axes.plot(*shadow.T, color="0.85")
     axes.plot(*box.T, color="#0072B2")
     axes.set(aspect="equal", title=name)
