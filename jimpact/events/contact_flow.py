@@ -691,7 +691,7 @@ class ContactFlow(Flow):
         by_x, by_g, _, _ = self.kinds(which)
         if self.slopes:
             corner = self.at_corner(phase, y, by_g)
-            y = jnp.where(corner, without_slope(y), y)
+            y = without_slope(y, corner)
         if self.slackens:
             closed = by_x & (phase == Phase.OPEN)
             after, rows = self._slackening(phase, self.rows(y), by_x, by_g)

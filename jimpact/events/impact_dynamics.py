@@ -366,7 +366,7 @@ def impulses_and_time(
 
 def with_slopes_unless(mask: Bool[Array, "1 B"], p: Any) -> Any:
     """Impulses p, with NaN for each tangent where the `mask` is True."""
-    return pushforward(lambda p: jnp.where(mask, without_slope(p), p), p)
+    return pushforward(lambda p: without_slope(p, mask), p)
 
 
 @dataclasses.dataclass(frozen=True)

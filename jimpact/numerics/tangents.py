@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jimpact.tools.loops import varying_like
 
@@ -118,16 +118,20 @@ def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
 
 
 @jax.custom_jvp
-def without_slope(x: Float[Array, "*rows"]) -> Float[Array, "*rows"]:
-    """x as it is where it has no derivative: all of its tangents are NaN."""
+def without_slope(
+    x: Float[Array, "*rows"], where: Bool[Array, "*lanes"]
+) -> Float[Array, "*rows"]:
+    """x as it is, without a derivative `where` it has none: its tangents are NaN there.
+
+    A choice between two x by `jnp.where` would be NaN everywhere in reverse mode.
+    """
     return x
 
 
 @without_slope.defjvp
-def _no_slope(
-    primals: tuple[Float[Array, "*rows"]], tangents: tuple[Float[Array, "*rows"]]
-) -> tuple[Float[Array, "*rows"], Float[Array, "*rows"]]:
-    """x, and NaN for each tangent."""
-    (x,) = primals
-    (rate,) = tangents
-    return without_slope(x), jnp.nan * rate
+def _no_slope(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    """x, and its tangent times NaN, or 1."""
+    x, where = primals
+    rate, _ = tangents
+    factor = jnp.where(where, jnp.nan, jnp.ones((), x.dtype))
+    return without_slope(x, where), factor * rate

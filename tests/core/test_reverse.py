@@ -73,7 +73,7 @@ def test_adjoints_agree_where_they_have_a_mode():
     )
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_checkpoints_have_the_reverse_mode_only():
     exact = jax.jit(jax.jacfwd(last_velocity("jacobian")))(AT)
     checkpoints = last_velocity("checkpoints")
